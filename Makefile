@@ -7,9 +7,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PINS := constraints.txt
-FORMATTED := doedesign fab sim tests bench examples
+FORMATTED := doedesign fab sim tests bench examples docs
 
-.PHONY: demo train-demo test test-slow campaign mutants lint bench clean
+.PHONY: demo train-demo test test-slow campaign mutants lint bench docs clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.base
@@ -42,14 +42,20 @@ lint: $(VENV)/.dev
 bench: $(VENV)/.bench
 	$(BIN)/python -m bench
 
+# The site, in build/site; its pictures are drawn once and kept in build/pictures.
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo build/site/index.html
+
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
-	find doedesign fab sim tests bench examples -name __pycache__ -prune -exec rm -rf {} +
+	find doedesign fab sim tests bench examples docs -name __pycache__ -prune -exec rm -rf {} +
 
+# Not compiled here: modules of libraries that are used are on first use, and all of them take a quarter of this time.
 # The stamp files say which set is installed; they are renewed when the project's needs or pins change.
 $(VENV)/.base: pyproject.toml $(PINS) | $(BIN)/python
 	@echo "Installing doedesign and its libraries into $(VENV) (about a minute) ..."
-	@$(PIP) install --constraint $(PINS) --editable .
+	@$(PIP) install --no-compile --constraint $(PINS) --editable .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(PINS) | $(BIN)/python
@@ -60,6 +66,11 @@ $(VENV)/.dev: pyproject.toml $(PINS) | $(BIN)/python
 $(VENV)/.bench: pyproject.toml $(PINS) | $(BIN)/python
 	@echo "Installing doedesign with the peers it is measured against into $(VENV) ..."
 	@$(PIP) install --constraint $(PINS) --editable '.[bench]'
+	@touch $@ $(VENV)/.base
+
+$(VENV)/.docs: pyproject.toml $(PINS) | $(BIN)/python
+	@echo "Installing what builds the documentation into $(VENV) (about a minute) ..."
+	@$(PIP) install --constraint $(PINS) --editable '.[docs]'
 	@touch $@ $(VENV)/.base
 
 $(BIN)/python:

@@ -70,7 +70,8 @@ def digests() -> dict[str, str]:
         folder = Path(name) / "session"
         folder.mkdir()
         session(folder)
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        # What commands cost differs from call to call.
+        files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "cost.jsonl")
         return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 

@@ -22,8 +22,9 @@ from bench.reference import wrapped_map
 from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.design.design import Design
 from doedesign.prediction import predict
+from doedesign.runtime.pool import evaluate_here
 from doedesign.spec import load_spec
-from doedesign.tolerancing.pool import DrawModel, evaluate_here, predicted_rows
+from doedesign.tolerancing.pool import DrawModel, predicted_rows
 from fab.draws import normal_draw
 from fab.level_map import LevelMap
 from fab.levels import Levels, height_of, quantise

@@ -45,10 +45,10 @@ from doedesign.recon.conv import convolution
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.tiles import reconstruct_tiled
 from doedesign.spec import Spec, load_spec
-from doedesign.training.backbones import convolutions, weight_shapes
 from doedesign.training.checkpoint import settled
+from doedesign.training.distance.backbones import convolutions, weight_shapes
+from doedesign.training.distance.perceptual import Lpips
 from doedesign.training.joint import JointState, Trainer
-from doedesign.training.perceptual import Lpips
 from sim.imaging.convolve import fast_length
 from sim.imaging.scene import Obstruction, Scene
 

@@ -26,14 +26,19 @@ the result:
     tolerancing     yield, sensitivities and error budgets of a process
     calibration     the process errors that explain measured PSFs
     capture         scenes photographed through a plate
+    hdr             lamps beyond the full well, read from weak copies that a plate throws beside them
     recon           the reconstruction network
     training        its training, with the plate or alone
-    report          pictures
+    evaluation      the tables and figures of the paper: every method on the same captures
+    report          pictures, and `write_report`: the page of a run
+    overview        results on the disk at a glance: kinds, main numbers, comparison
+    reference       keys of a spec, numbers and files of results, each with its one definition
     runtime         progress, signals, compilation
     cli             the command line
 
-Conventions (see README.md): in specs a length is text with a unit (`pitch = "1.85 um"`), everywhere else an SI number
-with the unit in its name (`pitch_m`); functions take either. Importing this package imports nothing heavy.
+Conventions (see docs/explanation/conventions.md): in specs a length is text with a unit (`pitch = "1.85 um"`),
+everywhere else an SI number with the unit in its name (`pitch_m`); functions take either. Importing this
+package imports nothing heavy.
 """
 
 import lazy_loader

@@ -16,6 +16,8 @@ from .capture.simulate import simulate as simulate
 from .design.design import Design as Design
 from .design.objectives import PsfSet as PsfSet
 from .design.objectives import import_objectives as import_objectives
+from .evaluation.evaluate import evaluate as evaluate
+from .evaluation.tables import EvaluationTable as EvaluationTable
 from .focus.depth import FocusTable as FocusTable
 from .focus.depth import focus_table as focus_table
 from .focus.foci import Foci as Foci
@@ -29,6 +31,7 @@ from .recon.files import reconstruct_files as reconstruct_files
 from .recon.model import Model as Model
 from .recon.reconstruction import Reconstruction as Reconstruction
 from .refinement import refine as refine
+from .report.page.write import write_report as write_report
 from .runs.certificate import Certificate as Certificate
 from .runs.certificate import certify as certify
 from .runs.fabricated import FabricatedPsfs as FabricatedPsfs

@@ -26,7 +26,8 @@ from doedesign.design.optimize import (
 )
 from doedesign.design.problem import Problem, SourceSet, problem_of
 from doedesign.prediction import on_target
-from doedesign.report.history import plot_history
+from doedesign.report.history import history_note, plot_history, plot_spot_history
+from doedesign.runs.curve_tables import encircled_csv, mtf_csv
 from doedesign.runs.folder import (
     Run,
     begin_run,
@@ -53,7 +54,7 @@ from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.metrics import without_infinities
 from sim.optic import HeightOptic
-from sim.plots.curves import plot_encircled, plot_mtf
+from sim.plots.curves import encircled_curves, plot_encircled, plot_mtf
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
@@ -332,13 +333,18 @@ def write_results(
         names += [f"{aimed.name}.csv", f"{aimed.name}.png"]
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     save(plot_height(HeightMap(height, camera.grid, spec.doe.relief), levels, spec.name), run.path("height.png"))
-    save(plot_psfs(bank, camera, near, far, remark=remark), run.path("psf.png"))
+    save(plot_psfs(bank, camera, near, far, title=spec.name, remark=remark), run.path("psf.png"))
     transfers = [mtf(each, depths=(*near, *far)) for each in (drawn, flat)]
-    save(plot_mtf(transfers[0], camera, near, far, transfers[1]), run.path("mtf.png"))
-    save(plot_encircled(bank, camera, near, far, lens), run.path("encircled.png"))
-    names += ["height.png", "psf.png", "mtf.png", "encircled.png"]
+    save(plot_mtf(transfers[0], camera, near, far, transfers[1], title=spec.name), run.path("mtf.png"))
+    within = encircled_curves([bank, lens])
+    save(plot_encircled(bank, camera, near, far, lens, title=spec.name, curves=within), run.path("encircled.png"))
+    write_atomic(run.path("mtf.csv"), mtf_csv(*transfers).encode())
+    write_atomic(run.path("encircled.csv"), encircled_csv(bank, within, camera).encode())
+    names += ["height.png", "psf.png", "mtf.png", "mtf.csv", "encircled.png", "encircled.csv"]
     if design.history:
-        save(plot_history(design.history), run.path("history.png"))
+        drawing = plot_history if spec.spots is None else plot_spot_history
+        picture = drawing(design.history, title=spec.name, note=history_note(spec))
+        save(picture, run.path("history.png"))
         names.append("history.png")
     for number, one in enumerate(patterns, 1):
         named = [] if one.colour is None or one.depth_m is None else [one.colour, format_length(one.depth_m)]

@@ -3,8 +3,9 @@
 A process that etches 3 % too deep and widens every opening by 0.1 um makes the design from etches 3 % shallower and
 openings drawn 0.1 um smaller. Where errors do not cancel like that (walls that lean, corners, etch lag, masks that lie
 off), NLopt looks on from there, over a depth and a move of the edges for every mask, for the plate whose light comes
-nearest to the design's: the least loss of the spec's objectives, spots, areas or foci, and the least difference of the
-PSFs where it has none. The plate looked at is the one that the process makes with every error at its mean.
+nearest to the design's: the least difference of the PSFs, or for spots, areas and foci the least loss of these. The
+loss of a spec's objectives may be less than the design's own, with another light than was designed; it is taken on
+request alone. The plate looked at is the one that the process makes with every error at its mean.
 """
 
 import contextlib
@@ -170,7 +171,7 @@ class _Task:
                 except InputError:  # beyond the model
                     return worst + 1.0
                 worst = max(worst, found)
-                progress.advance(next(tried), f"loss {found:.4f}")
+                progress.advance(next(tried), f"loss {found:.4g}")
                 return found
 
             # On the quick example with masks that lie off, Sbplx took 57 s to a loss for which MMA, with the exact
@@ -195,7 +196,7 @@ def precompensate(
     *,
     process: Process | str | Path | None = None,
     random: Sequence[str] = (),
-    by: Literal["loss", "psfs"] = "loss",
+    by: Literal["psfs", "loss"] | None = None,
     objectives: Mapping[str, Objective] | None = None,
     evaluations: int = EVALUATIONS,
     overwrite: bool = False,
@@ -214,8 +215,9 @@ def precompensate(
             the run's spec by default.
         random: errors that are drawn anew for every plate, such as "overlay", by the names that a calibration takes: an
             estimate of them is that of one plate, so they are those of the run's own process.
-        by: the least "loss" of the spec's objectives, spots, areas or foci, which may be less than the design's own; or
-            the least difference of the "psfs" from the design's, as for a spec that has none of them.
+        by: the least difference of the "psfs" from the design's, or the least "loss" of the spec's objectives, which
+            may be less than the design's own, with another light; by default "loss" for spots, areas and foci, and
+            "psfs" for all else.
         objectives: objectives of the user's own, by the names that the spec gives them.
         evaluations: plates of the search; 0 leaves it at what undoes the mean of depths and line widths.
         overwrite: where the folder has another run, remove it with all that was made of it.
@@ -243,7 +245,7 @@ def precompensate(
     folder = Path(out or Path("runs") / _next_name(drawn))
     if folder.resolve() == run.folder.resolve():
         raise InputError(str(folder), "the new run needs a folder of its own", "that of the run", "Give another.")
-    files = _files(drawn.spec)
+    files, by = _files(drawn.spec), by or ("loss" if drawn.spec.aims else "psfs")
     about = {
         "run": drawn.spec.name,
         "level_map_sha256": aim.digest,

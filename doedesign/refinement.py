@@ -56,9 +56,9 @@ class _Row(NamedTuple):
     cell: str
     light: str
     terms: int
-    efficiency: float
+    on_target: float
     uniformity_error: float
-    zeroth_order: float
+    zeroth_order_efficiency: float
 
 
 class _Cell(NamedTuple):
@@ -151,8 +151,8 @@ def _refine_in(run: Run, cell: _Cell, task: RefinementTask, about: dict[str, Any
     rows = _table(cell, task, level)
     for row in rows:
         log.info(
-            f"{row.cell}, {row.light}: {100 * row.efficiency:.2f} % of the light, uniformity error "
-            f"{100 * row.uniformity_error:.2f} %, 0th order {100 * row.zeroth_order:.2f} %"
+            f"{row.cell}, {row.light}: {100 * row.on_target:.2f} % of the light, uniformity error "
+            f"{100 * row.uniformity_error:.2f} %, 0th order {100 * row.zeroth_order_efficiency:.2f} %"
         )
     design = _repeated(cell, run.spec, level, tuple(history))
     names = write_results(run, (), design, {"refinement": [row._asdict() for row in rows]})

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from doedesign.cli import exit_code
-from doedesign.training.perceptual import weights_of
+from doedesign.training.distance.perceptual import weights_of
 from fab.errors import InputError
 from fab.files import write_atomic
 

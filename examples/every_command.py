@@ -31,10 +31,13 @@ def commands(spec: Path, name: str) -> Iterator[list[str]]:
         name: of its design.
     """
     run, order = Path("runs") / name, Path("masks") / name
+    yield ["doctor"]
     yield ["new"]
+    yield ["spec", "optimize.steps"]
     yield ["optimize", str(spec)]
     yield ["optimize", str(HERE / "cell.toml")]
     yield ["refine", str(Path("runs") / "cell"), "--steps", "10"]
+    yield ["compare", str(Path("runs") / "cell"), str(Path("runs") / "cell_refined")]
     yield ["masks", str(run)]
     yield ["verify", str(order)]
     yield ["psf", str(run)]
@@ -43,6 +46,8 @@ def commands(spec: Path, name: str) -> Iterator[list[str]]:
     yield ["tolerance", str(run), "--draws", "40"]
     yield ["simulate", str(run)]
     yield ["train", str(run)]
+    yield ["evaluate", str(run), "--pairs", "6"]
+    yield ["evaluate", str(run), "--figure", "8"]
     items = sorted(path.parent for path in (run / "simulated").glob("*/capture.exr"))
     yield ["reconstruct", str(run), str(items[0] / "capture.exr")]
     yield ["finetune", str(run), "--pairs", str(pairs_of(items, Path("pairs"))), "--steps", "10"]
@@ -50,6 +55,9 @@ def commands(spec: Path, name: str) -> Iterator[list[str]]:
     estimate = run / "calibration" / "process-estimate.toml"
     yield ["precompensate", str(run), "--process", str(estimate), "--random", "overlay", "--evaluations", "30"]
     yield ["calibrate", str(run), "--ring-to-disc", "1", "--probe", "520 nm", "--depth", "10 mm", "--no-pairs"]
+    yield ["runs"]
+    yield ["show", str(run), "all", "--print"]
+    yield ["report", str(run)]
 
 
 def pairs_of(items: list[Path], folder: Path) -> Path:

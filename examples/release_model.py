@@ -2,7 +2,8 @@
 
     python examples/release_model.py TRAINED [ORDER] [--out masks/released]
 
-TRAINED is the folder of a training (RUN/trained), ORDER what `doedesign masks TRAINED --out ORDER` wrote. OUT gets
+TRAINED is the folder of a training (RUN/trained), ORDER what `doedesign masks TRAINED --out ORDER` wrote, or the
+manifest of an order of the same plate. OUT gets
 
     network.npz     weights in half precision, what they were trained on and under which licences
     psf.exr         PSFs of the plate
@@ -17,6 +18,7 @@ folder for its plate.
 
 import argparse
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from see_through import photographed
@@ -38,8 +40,16 @@ TOLD = ("camera", "licence", "obstruction", "obstruction_parameters", "occlusion
 SCORED = ("capture", "reconstruction", "wiener_far")
 
 
-def release(trained: Path, order: Path | None, out: Path) -> None:
+def release(
+    trained: Path, order: Path | None, out: Path, *, pictures: Sequence[Mapping[str, str]] | None = None
+) -> None:
     """Write the folder.
+
+    Args:
+        trained: folder of a finished training behind a plate.
+        order: folder of the plate's mask order, or a manifest of one.
+        out: the folder.
+        pictures: name, digest and licence of every picture that was trained on, for the manifest.
 
     Raises:
         InputError: no finished training behind a plate, or an order of another plate.
@@ -53,7 +63,7 @@ def release(trained: Path, order: Path | None, out: Path) -> None:
         write_atomic(out / name, (trained / name).read_bytes())
     names = [NETWORK_NAME, *COPIED, "capture.png"]
     if order is not None:
-        drawn = read_json(order / MANIFEST_NAME)
+        drawn = read_json(order / MANIFEST_NAME if order.is_dir() else order)
         if drawn["level_map_sha256"] != read_level_map(trained / LEVEL_MAP).digest:
             cure = "Draw it with: doedesign masks TRAINED --out ORDER"
             raise InputError(str(order), "the order must be drawn from this plate", "another plate's", cure)
@@ -69,6 +79,7 @@ def release(trained: Path, order: Path | None, out: Path) -> None:
         "trained": {key: manifest[key] for key in TOLD} | {"steps": model.about["steps"]},
         "held_out": {kind: scores[kind] for kind in SCORED} | {"scenes": len(scores["scenes"])},
         "capture": {"near_m": chain.near_m, "words": chain.words},
+        **({} if pictures is None else {"pictures": list(pictures)}),
         "results_sha256": {name: sha256_file(out / name) for name in sorted(names)},
     }
     write_atomic(out / MANIFEST_NAME, canonical_json(said))

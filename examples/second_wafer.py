@@ -59,7 +59,7 @@ NODES = 3  # of Gauss's rule per axis of a pixel
 
 
 class WaferErrors(NamedTuple):
-    """Errors of a plate, mask 0 first: share of depth, growth per edge (metres), and places (y, x, metres)."""
+    """Errors of a plate, first mask first: share of depth, growth per edge (metres), and places (y, x, metres)."""
 
     deep: Float[np.ndarray, " mask"]
     wide_m: Float[np.ndarray, " mask"]

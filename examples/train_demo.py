@@ -40,9 +40,9 @@ from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_spec
-from doedesign.training.evaluation import SCENE_SEED
 from doedesign.training.scores import mean_and_interval, paired_difference, scores
 from doedesign.training.train import train
+from doedesign.training.validation import SCENE_SEED
 from fab.errors import InputError
 from fab.files import canonical_json, write_atomic
 from sim.light import srgb_from_linear

@@ -11,7 +11,7 @@ import io
 import math
 import textwrap
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from html import escape
@@ -127,6 +127,19 @@ def panels(
         root: Any = figure.get_figure(root=True)
         if engine := root.get_layout_engine():
             engine.execute(root)
+
+
+def legend_above(figure: "FigureBase", handles: Sequence[Any], title: str) -> None:
+    """Put a legend above all panels, under a title: `panels` would write the title over it.
+
+    Args:
+        figure: the figure.
+        handles: its lines and marks.
+        title: the title.
+    """
+    where: dict[str, Any] = {"loc": "outside upper left", "ncols": len(handles), "borderpad": 0.0}
+    words = figure.legend(handles=list(handles), title=title, title_fontsize=12, alignment="left", **where).get_title()
+    words.set_parse_math(False)
 
 
 @contextmanager

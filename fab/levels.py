@@ -41,7 +41,7 @@ class Levels:
         count: number of levels L, a whole number from 2 to 64.
         step_m: height of one step, metres; `count` steps are the height of one wave of the design, after which heights
             repeat.
-        depths_m: how deep each mask etches, metres, mask 0 first; ``2**k * step_m`` where none are given.
+        depths_m: how deep each mask etches, metres, first mask first; ``2**k * step_m`` where none are given.
 
     Raises:
         InputError: a count that is not a whole number from 2 to 64, a step that is not positive, or depths that are not
@@ -67,7 +67,7 @@ class Levels:
         depths = tuple(float(depth) for depth in self.depths_m)
         if depths and len(depths) != self.bits:
             rule = f"{self.count} levels must have {self.bits} etches"
-            raise InputError("etch depths", rule, f"{len(depths)} depths", "Give one depth per mask, mask 0 first.")
+            raise InputError("etch depths", rule, f"{len(depths)} depths", "Give one depth per mask, first mask first.")
         for depth in depths:
             if not 0 < depth < math.inf:
                 raise InputError("etch depths", "must be positive and finite", depth, 'Give depths such as "75 nm".')
@@ -232,7 +232,7 @@ def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
 
 
 def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], levels: Levels) -> NDArray[np.uint8]:
-    """Join etch masks ``[bit, y, x]`` of 0 and 1, mask 0 first, into the level map ``[y, x]`` that they make."""
+    """Join etch masks ``[bit, y, x]`` of 0 and 1, first mask first, into the level map ``[y, x]`` that they make."""
     if bit_planes.ndim != 3 or bit_planes.shape[0] != levels.bits:
         rule = f"{levels.count} levels need {levels.bits} planes [bit, y, x]"
         raise InputError("bit planes", rule, f"shape {bit_planes.shape}", "Give one plane per mask.")

@@ -242,3 +242,23 @@ def write_pixels(
         writer = png.Writer(rows.shape[1], rows.shape[0], greyscale=grey, bitdepth=16, compression=compression)
         writer.write_packed(stream, (row.tobytes() for row in rows.astype(">u2")))
         write_atomic(path, stream.getvalue())
+
+
+def webp_bytes(values: NDArray[np.uint8], quality: int | None = None, *, most_px: int | None = None) -> bytes:
+    """Return a picture as a WebP file for a page; the same values give the same bytes.
+
+    Args:
+        values: `[y, x]` or `[y, x, 3]`, row 0 at the lowest y.
+        quality: 0 to 100, losing what eyes hardly see; None loses nothing.
+        most_px: its longer side is shrunk to so many pixels by averaging; None leaves it.
+    """
+    from PIL import Image
+
+    image = Image.fromarray(np.ascontiguousarray(values[::-1]))
+    if most_px is not None and max(image.size) > most_px:
+        width, height = (max(1, round(n * most_px / max(image.size))) for n in image.size)
+        image = image.resize((width, height), Image.Resampling.BOX)
+    stream = io.BytesIO()
+    given: dict[str, Any] = {"lossless": True, "quality": 20} if quality is None else {"quality": quality}
+    image.save(stream, "WEBP", method=1, **given)
+    return stream.getvalue()

@@ -41,7 +41,12 @@ __all__ = [
 
 
 class Normal(NamedTuple):
-    """How an error is distributed: normal with this mean and standard deviation."""
+    """How an error is distributed: normally.
+
+    Attributes:
+        mean: mean, in the SI unit of the error.
+        sigma: standard deviation, likewise.
+    """
 
     mean: float = 0.0
     sigma: float = 0.0
@@ -148,7 +153,7 @@ class Process:
         return self.levels.bits
 
     def depths_m(self) -> tuple[float, ...]:
-        """Nominal depth of every mask's etch, mask 0 first."""
+        """Nominal depth of every mask's etch, first mask first."""
         return self.levels.depths_m
 
     def expected(self) -> Variation:

@@ -8,6 +8,7 @@ from .imaging.field import FieldOptics as FieldOptics
 from .imaging.field import capture_frame as capture_frame
 from .imaging.formation import Optics as Optics
 from .imaging.formation import capture as capture
+from .imaging.glare import Glare as Glare
 from .imaging.scene import Obstruction as Obstruction
 from .imaging.scene import Scene as Scene
 from .light import linear_from_srgb as linear_from_srgb

@@ -34,7 +34,13 @@ Polarised = Literal["unpolarised", "x", "y"]
 
 @dataclass(frozen=True)
 class Colour:
-    """One colour channel: vacuum wavelengths in metres and their weights, which sum to 1."""
+    """One colour channel.
+
+    Attributes:
+        name: name of the channel.
+        wavelengths_m: vacuum wavelengths, metres.
+        weights: their weights, which sum to 1.
+    """
 
     name: str
     wavelengths_m: tuple[float, ...]
@@ -42,10 +48,14 @@ class Colour:
 
 
 class SpectralLine(NamedTuple):
-    """One wavelength of the colour channel of that number.
+    """One wavelength of a colour channel.
 
-    `factor` is its weight in the channel times the power that passes the substrate's two faces; of a beam of several
-    modes times the share of the mode of that number (`sim.illumination`).
+    Attributes:
+        colour: number of the channel.
+        wavelength_m: vacuum wavelength, metres.
+        factor: weight in the channel times the power that passes the substrate's two faces; of a beam of several modes
+            times the share of the mode.
+        mode: number of the mode of the beam (`sim.illumination`).
     """
 
     colour: int

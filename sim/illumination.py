@@ -31,13 +31,14 @@ class GaussianBeam:
     """A Gaussian beam.
 
     Attributes:
-        radius_m: radii (y, x) at the waist where the intensity is 1/e² of that in the middle, of the whole beam.
-        waist_distance_m: distance of the waist before the DOE, negative behind it.
+        radius_m: radii (y, x), metres, at the waist where the intensity is 1/e² of that in the middle, of the whole
+            beam.
+        waist_distance_m: distance of the waist before the DOE, metres, negative behind it.
         m_squared: beam quality M² (y, x), at least 1.
-        centre_m: place (y, x) of its axis on the DOE.
-        angle_rad: angles (y, x) between its axis and that of the DOE, positive where light travels toward +y or +x; the
-            sensor's window follows.
-        tilt_rad: the same, added to it; the sensor's window stays.
+        centre_m: place (y, x) of its axis on the DOE, metres.
+        angle_rad: angles (y, x) between its axis and that of the DOE, radians, positive where light travels toward +y
+            or +x; the sensor's window follows.
+        tilt_rad: angles (y, x) added to these, radians; the sensor's window stays.
     """
 
     radius_m: Pair
@@ -76,6 +77,11 @@ class GaussianBeam:
         """Curvature of its wavefront at the DOE, the mean of both axes."""
         return sum(self._at_doe(axis, wavelength_m)[1] for axis in (0, 1)) / 2
 
+    def diameters_m(self, wavelength_m: float) -> Pair:
+        """Diameters (y, x) of the whole beam on the DOE, metres, where the intensity is 1/e² of that in the middle."""
+        y, x = (2 * self._at_doe(axis, wavelength_m)[0] * np.sqrt(self.m_squared[axis]) for axis in (0, 1))
+        return float(y), float(x)
+
     def amplitude_per_m(
         self, grid: Grid, aperture: Aperture, wavelength_m: float, mode: int
     ) -> Complex[np.ndarray, "y x"]:
@@ -95,10 +101,10 @@ class MeasuredBeam:
 
     Attributes:
         intensity: `[y, x]` intensity, not negative, in any unit.
-        pixel_m: distance of its pixels.
-        centre_m: place (y, x) of the picture's middle on the DOE.
-        angle_rad: angles (y, x) of its axis, which the sensor's window follows.
-        tilt_rad: the same, added to it; the window stays.
+        pixel_m: distance of its pixels, metres.
+        centre_m: place (y, x) of the picture's middle on the DOE, metres.
+        angle_rad: angles (y, x) of its axis, radians, which the sensor's window follows.
+        tilt_rad: angles (y, x) added to these, radians; the window stays.
     """
 
     intensity: Float[np.ndarray, "y x"] = field(repr=False)
@@ -148,9 +154,9 @@ class EvenBeam:
     """Light that is as bright all over the aperture, of whose power energies are shares.
 
     Attributes:
-        distance_m: distance of the point before the DOE that it comes from; infinite for a plane wave.
-        angle_rad: angles (y, x) of its chief ray, which the sensor's window follows.
-        tilt_rad: the same, added to it; the window stays.
+        distance_m: distance of the point before the DOE that it comes from, metres; infinite for a plane wave.
+        angle_rad: angles (y, x) of its chief ray, radians, which the sensor's window follows.
+        tilt_rad: angles (y, x) added to these, radians; the window stays.
     """
 
     distance_m: float = np.inf

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from scipy.fft import fft2
+from scipy.fft import fft
 
 from fab.grid import Grid
 from sim.aperture import circle_coverage
@@ -98,10 +98,10 @@ class RingToDisc(NamedTuple):
 
 
 def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
-    """Ring:disc ratio of a near `psf` of a `camera` (3:1 in the paper's simulation, 1:1 in its prototype).
+    """Ring:disc ratio of a near `psf` `[y, x]` of a `camera` (3:1 in the paper's simulation, 1:1 in its prototype).
 
-    The disc is the geometric defocus disc of `depth_m` widened by one pixel, where light that the DOE does not diffract
-    lands; without light in it the ratio is infinite.
+    The disc is the geometric defocus disc of `depth_m`, metres, widened by one pixel, where light that the DOE does not
+    diffract lands; without light in it the ratio is infinite.
     """
     radius = camera.defocus_radius_m(depth_m) + camera.pixel_m
     disc = energy_within(psf, camera.pixel_m, radius)
@@ -180,8 +180,8 @@ class EnergyBudget(NamedTuple):
 
     blocked: float  # of the beam by the chrome around the opening; 0 without a beam
     reflected: float  # by the two faces of the substrate
-    spot: float  # inside the far-spot radius of the window
-    window: float  # elsewhere in the sensor window
+    far_spot: float  # inside the far-spot radius of the window, at every depth
+    window_beside_spot: float  # elsewhere in the sensor window: throughput less far_spot
     uncollected: float  # within the DOE grid's band, but outside the window or between light-sensitive squares
     higher_orders: float  # at angles beyond lambda / (2 pitch), scattered by the square cells and the aperture's edge
 
@@ -191,22 +191,24 @@ def _band_energy(field: Complex[np.ndarray, "y x"], slope: float, band: float = 
 
     The band reaches to `band` waves per cell on either side of the axis; at most to that of the cells' grid, 1/2.
     The factor sinc(nu - slope x) of a cell is interpolated between three directions, exact to 1e-3 up to a sixth of the
-    band, so nine transforms take the place of one sum per cell.
+    band, along each axis for itself: three transforms of all rows and three of all columns take the place of one sum
+    per cell.
     """
     reach = slope * max(field.shape) / 2
     nodes = reach * np.cos(np.pi * np.array([1, 3, 5]) / 6) if slope else np.zeros(1)
-    axes = []
-    for cells in field.shape:
+    # Columns first: those that lie beyond the band need no transform along y.
+    for axis in (1, 0):
+        cells = field.shape[axis]
         lit, nu = slope * (np.arange(cells) - (cells - 1) / 2), np.fft.fftfreq(cells)
-        shares = [np.prod([(lit - b) / (a - b) for b in nodes if b != a], axis=0) * np.ones(cells) for a in nodes]
-        axes.append((shares, [np.sinc(nu - a) for a in nodes], (nu >= -band) & (nu < band)))
-    (shares_y, seen_ys, inside_y), (shares_x, seen_xs, inside_x) = axes
-    total = np.zeros(field.shape, np.complex64)
-    for share_y, seen_y in zip(shares_y, seen_ys, strict=True):
-        for share_x, seen_x in zip(shares_x, seen_xs, strict=True):
-            part = field * (share_y[:, None] * share_x).astype(np.float32)
-            total += np.asarray(fft2(part, workers=-1)) * (seen_y[:, None] * seen_x).astype(np.float32)
-    return float(np.sum(np.square(np.abs(total[np.ix_(inside_y, inside_x)])), dtype=np.float64))
+        inside = (nu >= -band) & (nu < band)
+        along: tuple[int, int] = (-1, 1) if axis == 0 else (1, -1)
+        summed = np.zeros(field.shape, np.complex64)
+        for a in nodes:
+            share = np.prod([(lit - b) / (a - b) for b in nodes if b != a], axis=0) * np.ones(cells)
+            part = fft(field * share.astype(np.float32).reshape(along), axis=axis, workers=-1)
+            summed += np.asarray(part) * np.sinc(nu - a).astype(np.float32).reshape(along)
+        field = summed if inside.all() else summed.compress(inside, axis)
+    return float(np.sum(np.square(np.abs(field)), dtype=np.float64))
 
 
 def energy_budget(
@@ -348,6 +350,7 @@ class Metric:
     worse: Literal["high", "low"] | None = None
     unit: Literal["1", "%", "m"] = "1"  # "1", "m", or "%" for a share, which is shown in per cent
     aimed: bool = False  # whether it is known only of a DOE that should draw something
+    definition: str = ""  # what it is, with its formula; the reference of numbers takes it from here
 
     @property
     def share(self) -> bool:
@@ -358,24 +361,55 @@ class Metric:
 _BOTH = ("design", "fabricated")
 
 
-def _aimed_metric(name: str, label: str, worse: Literal["high", "low"]) -> Metric:
-    return Metric(label, lambda e, c, d: (e.aimed or {})[name], ("fabricated",), "far", worse, "%", aimed=True)
+def _aimed_metric(name: str, label: str, worse: Literal["high", "low"], definition: str) -> Metric:
+    of: Any = lambda e, c, d: (e.aimed or {})[name]  # noqa: E731
+    return Metric(label, of, ("fabricated",), "far", worse, "%", aimed=True, definition=definition)
 
 
 METRICS: Mapping[str, Metric] = MappingProxyType(
     {
-        "zeroth_order": Metric("0th order", lambda e, c, d: e.orders[c], _BOTH, worse="high", unit="%"),
-        "strehl": Metric("Strehl ratio", lambda e, c, d: e.strehls[c], ("fabricated",), worse="low"),
-        "throughput": Metric("throughput", lambda e, c, d: total(e.energy[c, d]), _BOTH, worse="low", unit="%"),
+        "zeroth_order": Metric(
+            "0th order",
+            lambda e, c, d: e.orders[c],
+            _BOTH,
+            worse="high",
+            unit="%",
+            definition="share of the light that passes as if the DOE were flat: |c0|², c0 the mean transmission over "
+            "the open cells, weighted by the irradiance of the beam",
+        ),
+        "strehl": Metric(
+            "relative Strehl ratio",
+            lambda e, c, d: e.strehls[c],
+            ("fabricated",),
+            worse="low",
+            definition="overlap of the field behind the DOE with that of the design exactly as drawn, |mean of t "
+            "conj(t_drawn)|²: 1 for a plate made as drawn, whatever share of the light its design puts in "
+            "the spot (that is far_spot)",
+        ),
+        "throughput": Metric(
+            "throughput",
+            lambda e, c, d: total(e.energy[c, d]),
+            _BOTH,
+            worse="low",
+            unit="%",
+            definition="share of the light on the clear aperture, or of the beam's power, that lands in the sensor "
+            "window: far_spot + window_beside_spot",
+        ),
         "outside_window": Metric(
             "light outside the window",
             lambda e, c, d: e.passed(c) - total(e.energy[c, d]),
             ("fabricated",),
             worse="high",
             unit="%",
+            definition="share of the light that passes opening and glass and misses the sensor window",
         ),
         "chrome": Metric(
-            "light by chrome", lambda e, c, d: e.passed(c) - e.passed_as_drawn(c), ("fabricated",), unit="%"
+            "light by chrome",
+            lambda e, c, d: e.passed(c) - e.passed_as_drawn(c),
+            ("fabricated",),
+            unit="%",
+            definition="light that the chrome opening of the plate lets through beyond that of the design as drawn; "
+            "negative where it blocks more",
         ),
         "ring_to_disc": Metric(
             "ring:disc",
@@ -383,6 +417,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             _BOTH,
             "near",
             worse="low",
+            definition="light of the window outside the geometric defocus disc over that inside, the disc widened by "
+            "one pixel (disc_radius)",
         ),
         "disc_radius_m": Metric(
             "radius of the defocus disc",
@@ -390,23 +426,72 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             ("design",),
             "near",
             unit="m",
+            definition="radius of the geometric defocus disc of the depth and one pixel more, on the sensor; "
+            "disc_radius_rad, an angle, without one",
         ),
-        "concentration": Metric("concentration", lambda e, c, d: e.concentration(c, d), ("design",), "near"),
+        "concentration": Metric(
+            "concentration",
+            lambda e, c, d: e.concentration(c, d),
+            ("design",),
+            "near",
+            definition="sum of the squared pixel energies over that of the plain lens at the same depth: 1 for the "
+            "lens, less for light that is spread",
+        ),
         "concentration_bound": Metric(
-            "least concentration", lambda e, c, d: e.concentration_bound(c, d), ("design",), "near"
+            "least concentration",
+            lambda e, c, d: e.concentration_bound(c, d),
+            ("design",),
+            "near",
+            definition="least concentration of a near PSF that keeps all light in the window: s² + (1 - s)² a, s the "
+            "largest far_spot of the colour over the lens's light in the window, a the lens's defocus disc "
+            "as a share of the window; light that leaves the window may take a PSF below it",
         ),
-        "far_spot": Metric("far spot", lambda e, c, d: e.far_spot(c, d), _BOTH, "far", worse="low", unit="%"),
+        "far_spot": Metric(
+            "far spot",
+            lambda e, c, d: e.far_spot(c, d),
+            _BOTH,
+            "far",
+            worse="low",
+            unit="%",
+            definition="share of the light inside the far spot, a disc of spot_radius about the chief ray",
+        ),
         "spot_radius_m": Metric(
             "radius of the far spot",
             lambda e, c, d: spot_radius_m(e.camera, mean_wavelength_m(e.camera.colours[c])),
             ("design",),
             "far",
             unit="m",
+            definition="radius that counts as the far spot: the first dark ring of the ideal lens, 1.22 wavelength x "
+            "distance / aperture, and one pixel; spot_radius_rad, an angle, without a sensor",
         ),
-        "on_target": _aimed_metric("on_target", "light on the target", "low"),
-        "uniformity_error": _aimed_metric("uniformity_error", "uniformity error", "high"),
-        "contrast": _aimed_metric("contrast", "contrast", "high"),
-        "focus_width": _aimed_metric("focus_width", "largest width of the foci over that wanted", "high"),
+        "on_target": _aimed_metric(
+            "on_target",
+            "light on the target",
+            "low",
+            "share of the light on what the design should draw, without the loss at the glass faces: on all "
+            "spots; where at least 13.5 % of the light of an area is wanted (the worst area of several); "
+            "within the foci as wide as wanted, by their weights; of a target pattern inside its spots, or "
+            "where it is above half its peak",
+        ),
+        "uniformity_error": _aimed_metric(
+            "uniformity_error",
+            "uniformity error",
+            "high",
+            "(max - min) / (max + min) of the light of all spots, each over the light wanted there",
+        ),
+        "contrast": _aimed_metric(
+            "contrast",
+            "contrast",
+            "high",
+            "root mean square of light over light wanted less 1, where at least 90 % of an area's light is "
+            "wanted and in its dark frame; the worst of several areas",
+        ),
+        "focus_width": _aimed_metric(
+            "focus_width",
+            "largest width of the foci over that wanted",
+            "high",
+            "largest full width at half maximum of the foci over the width wanted; a tolerance study counts at most 10",
+        ),
     }
 )
 

@@ -238,6 +238,8 @@ class HeightOptic(CellOptic):
     """A DOE given by its height map, as a thin element.
 
     Attributes:
+        camera: lens, sensor and substrate.
+        coverage: `[y, x]` open share of every cell.
         height_m: `[y, x]` DOE height, metres; None where `deviation` holds all.
         deviation: `[line, y, x]` transmission of a DOE as fabricated over that of its heights, or None.
         source_kind: how sources are described; `SeparableSource` where a compiled step takes many of them.

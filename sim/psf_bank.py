@@ -164,7 +164,15 @@ class PsfBank(eqx.Module):
 
 
 class BankOptic(Optic):
-    """Known PSFs `[depth, c, y, x]`, the farthest first, mixed linearly in 1/z; beyond the outermost as there."""
+    """Known PSFs, mixed linearly in 1/z; beyond the outermost as there.
+
+    Attributes:
+        energies: `[depth, c, y, x]` energy per pixel, the farthest depth first.
+        inverse_depths: `[depth]` 1/z of the depths, per metre.
+        colours: names of the colour channels.
+        pixel_m: distance of the pixels, metres.
+        camera: lens and sensor, where they are known.
+    """
 
     energies: Float[Array, "d c y x"]
     inverse_depths: Float[Array, " d"]
@@ -245,7 +253,8 @@ def psf(
             in metres on `camera.grid`.
         camera: lens, sensor, substrate and DOE grid of a bare height map; another lens or sensor for an optic of cells.
         depths: one source depth or several, in metres or with a unit; "inf" for a star.
-        field_rad: field angles (y, x), positive where light travels toward +y or +x; the window follows the chief ray.
+        field_rad: field angles (y, x), radians, positive where light travels toward +y or +x; the window follows the
+            chief ray.
         propagation: far field, or one of the direct kernels; by default the one that the camera needs.
         sampling: intensity samples per lambda d / D (far field only); see `sim.propagation.farfield.plan_far_field`.
         on_psf: called after every single PSF, for progress.

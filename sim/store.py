@@ -53,6 +53,17 @@ class StoredHeight(NamedTuple):
     metadata: dict[str, str]  # the other text attributes
 
 
+class StoredBank(NamedTuple):
+    """A PSF bank as its file holds it, plain arrays."""
+
+    energy: Float[np.ndarray, "colour depth y x"]  # energy per pixel, row 0 at the lowest y
+    colours: tuple[str, ...]  # names of the colours
+    depths_m: tuple[float, ...]  # depths of the sources, metres
+    pixel: float  # pitch of a pixel, metres, or its direction sine
+    field_rad: tuple[float, float]  # field angle y, x, radians
+    sines: bool  # whether pixels have a sine
+
+
 def write_height(
     path: str | Path,
     height_m: Float[np.ndarray, "y x"],
@@ -77,7 +88,14 @@ def write_height(
 
 
 def read_height(path: str | Path) -> StoredHeight:
-    """Read the height map at a path; an InputError for no EXR file with a channel `height`, finite and at least 0."""
+    """Read a height map, `[y, x]` in metres.
+
+    Args:
+        path: an EXR file with a channel `height`.
+
+    Raises:
+        InputError: no such file, or heights that are not finite and at least 0.
+    """
     channels, texts = _read(Path(path))
     if "height" not in channels:
         rule = "a height map must have a channel named height, in metres"
@@ -116,8 +134,11 @@ def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[st
 
     Args:
         path: the file; its folder is made if missing.
-        bank: PSFs; a ValueError where two depths or colours have the same name.
-        extra: further text attributes; a ValueError for a name that is taken.
+        bank: PSFs.
+        extra: further text attributes.
+
+    Raises:
+        ValueError: two depths or colours have the same name, or the name of an attribute is taken.
     """
     channels = {
         _channel_name(depth, colour): bank.energy[c, d]
@@ -156,11 +177,7 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
     """
     from sim.psf_bank import PsfBank
 
-    channels, texts = _read(Path(path))
-    for name, pixels in channels.items():
-        if not np.isfinite(pixels).all():
-            rule = "a PSF must be finite"
-            raise InputError(f"{path}: channel {name}", rule, "NaN or infinity", "Write the file again.")
+    channels, texts = _read_psfs(path)
     if _BANK not in texts:
         colours = _measured_colours(path, channels)
         if pixel_m is None:
@@ -169,20 +186,43 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         stored = _length(path, "pixel pitch", pixel_m)
         energy = np.stack([channels[c] for c in colours])[:, None]
         return PsfBank(energy, colours, (float(depth_m),), stored)
-    colours, depths, stored, field, sines = _bank_description(path, texts[_BANK])
+    energy, colours, depths, stored, field, sines = _stored_bank(path, channels, texts)
     if pixel_m is not None and sines:
         rule = "pixels of a bank of directions have a sine in place of a pitch"
         raise InputError(str(path), rule, f"a pitch of {pixel_m:.9g} m", "Give PSFs on a sensor, or leave it out.")
     if pixel_m is not None and not np.isclose(pixel_m, stored, rtol=1e-6, atol=0):
         rule = "the pixel pitch given must be that of the file"
         raise InputError(str(path), rule, f"{pixel_m:.9g} m against {stored:.9g} m", "Leave it out: the file knows it.")
+    return PsfBank(energy, colours, depths, stored, field, sines=sines)
+
+
+def read_stored_bank(path: str | Path) -> StoredBank:
+    """Read the PSF bank of our own at a path as plain arrays, without jax; an InputError for anything else."""
+    channels, texts = _read_psfs(path)
+    if _BANK not in texts:
+        raise InputError(str(path), "must be a PSF bank of this package", "another picture", "Give the bank of a run.")
+    return _stored_bank(path, channels, texts)
+
+
+def _read_psfs(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "y x"]], dict[str, str]]:
+    """Channels with finite values, and text attributes."""
+    channels, texts = _read(Path(path))
+    for name, pixels in channels.items():
+        if not np.isfinite(pixels).all():
+            rule = "a PSF must be finite"
+            raise InputError(f"{path}: channel {name}", rule, "NaN or infinity", "Write the file again.")
+    return channels, texts
+
+
+def _stored_bank(path: str | Path, channels: Mapping[str, Any], texts: Mapping[str, str]) -> StoredBank:
+    colours, depths, stored, field, sines = _bank_description(path, texts[_BANK])
     names = [[_channel_name(depth, colour) for depth in depths] for colour in colours]
     missing = [name for row in names for name in row if name not in channels]
     if missing:
         rule = "every PSF of the bank must be there"
         raise InputError(str(path), rule, f"no channel {missing[0]}", "Write the file again.")
     energy = np.stack([np.stack([channels[name] for name in row]) for row in names])
-    return PsfBank(energy, colours, depths, stored, field, sines=sines)
+    return StoredBank(energy, colours, depths, stored, field, sines)
 
 
 def write_picture(path: str | Path, channels: Mapping[str, Any], extra: Mapping[str, str] | None = None) -> None:

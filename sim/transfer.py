@@ -8,6 +8,7 @@ sampled PSF does: pixels of 3.7 um sample an Airy disc of 1.3 um far below its N
 seem to resolve nothing at the sensor's own limit.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,9 @@ from sim.psf_bank import Length, depths_from, optic_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
+
+
+_AZIMUTHS = 72  # of the half turn that a radial mean takes; even, so that x and y are among them
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +109,45 @@ def mtf(
             otf[line.colour, d] += 1j * weight * np.interp(lag, lags, correlation.imag, right=0.0)
     pixel = np.sinc(camera.pixel_m * camera.fill * frequencies)
     return TransferBank(np.abs(otf * pixel), frequencies, depths_m, camera)
+
+
+def directional_mtf(
+    doe: CellOptic, depth_m: float, frequencies_per_m: Float[np.ndarray, " f"]
+) -> Float[np.ndarray, "c 3 f"]:
+    """MTF of a DOE, its lens and a pixel, before sampling: the mean over all directions, along x, and along y.
+
+    The pupil's autocorrelation is taken in two dimensions, bilinear between whole cells. The radial mean is that of
+    |OTF|, for the OTF of a plate that scatters has no phase that would be worth keeping.
+
+    Args:
+        doe: the DOE.
+        depth_m: of the source, metres.
+        frequencies_per_m: on the sensor, cycles per metre.
+
+    Returns:
+        ``[colour, way, frequency]`` MTF, 1 at frequency 0.
+    """
+    from scipy.fft import fft2, ifft2, next_fast_len
+    from scipy.ndimage import map_coordinates
+
+    camera = doe.camera
+    angles = np.arange(_AZIMUTHS) * np.pi / _AZIMUTHS
+    y, x = (np.outer(way, frequencies_per_m) for way in (np.sin(angles), np.cos(angles)))
+    otf = np.zeros((len(camera.colours), *y.shape), np.complex128)
+    for line in camera.lines:
+        field = np.asarray(doe.field(line, depth_m))
+        per_cell = line.wavelength_m * camera.sensor_distance_m / camera.grid.pitch_m
+        most = min(math.ceil(per_cell * frequencies_per_m[-1]) + 1, max(field.shape))
+        # Far enough that no lag that is asked for comes round from the other side.
+        shape = [next_fast_len(n + most) for n in field.shape]
+        spectrum: Any = fft2(field, shape, workers=-1)
+        correlation = np.asarray(ifft2(spectrum.real**2 + spectrum.imag**2, workers=-1))
+        around = np.arange(-most, most + 1)
+        part: Any = correlation[np.ix_(around, around)] / correlation[0, 0].real
+        places = [lag * per_cell + most for lag in (y, x)]
+        weight = line.factor / camera.transmission(line.wavelength_m)
+        for unit, values in ((1, part.real), (1j, part.imag)):
+            otf[line.colour] += weight * unit * map_coordinates(values.astype(np.float64), places, order=1)
+    side = camera.pixel_m * camera.fill
+    transfer = np.abs(otf * np.sinc(side * y) * np.sinc(side * x))
+    return np.stack([transfer.mean(axis=1), transfer[:, 0], transfer[:, _AZIMUTHS // 2]], axis=1)

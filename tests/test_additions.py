@@ -36,7 +36,7 @@ PLACES = {
 }
 # Names that the tables list beside what the blocks say.
 LISTED = [
-    ("sim/obstruction/__init__.py", "MaskFolder)\n", "MaskFolder, Sticker)\n"),
+    ("sim/obstruction/__init__.py", "ReleaseDirt, MaskFolder)", "ReleaseDirt, MaskFolder, Sticker)"),
     ("fab/solids/write.py", "mesh_files, step_files\n", "mesh_files, profile_file, step_files\n"),
 ]
 

@@ -1,10 +1,6 @@
-"""The notebook session of the README, as a user types it, with the quick spec; every value draws itself."""
+"""The session of docs/notebooks.md, as a user types it, with the quick spec; every value draws itself."""
 
-import json
 import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -111,18 +107,3 @@ def test_a_capture_and_its_reconstruction(design: dd.Design, tmp_path: Path):
     picture = dd.Model.released().reconstruct(shot)
     assert np.isfinite(np.asarray(picture.light)).all()
     picture.plot()
-
-
-def test_the_notebook_runs(tmp_path: Path):
-    """Cell by cell in a process of its own, beside a copy of the examples."""
-    cells = json.loads((EXAMPLES / "session.ipynb").read_text())["cells"]
-    program = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    shutil.copytree(EXAMPLES, tmp_path / "examples")
-    # Workers of a study import the main program, so it has to know that it is one.
-    indented = "".join(f"    {line}\n" for line in program.splitlines())
-    (tmp_path / "session.py").write_text(f'if __name__ == "__main__":\n{indented}')
-    done = subprocess.run(
-        [sys.executable, "session.py"], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600
-    )
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "masks" / "quick" / "manifest.json").is_file()

@@ -144,7 +144,7 @@ class AreaTable:
         sizes = {f"size_{name}_{unit}": p and p.size_m for name, p in profiles}
         edges = {f"edge_{name}_{unit}": p and p.edge_m for name, p in profiles}
         return (self.wave.summary() if self.wave else {}) | {
-            "efficiency": self.efficiency,
+            "on_target": self.efficiency,
             "contrast": self.contrast,
             "pixel_contrast": self.pixel_contrast,
             "zeroth_order": self.zeroth_order,

@@ -269,4 +269,4 @@ def remarks_on(result: Calibration, expected: Float[np.ndarray, "y x"]) -> Itera
         text = ", ".join(f"{rise:.2g}" for rise in result.rises)
         yield f"The posterior is not normal where it is widest: the cost rises by {text} instead of 1."
     if any(relative(name) for name in unknowns.names):
-        yield "Places of masks are relative to mask 0; a common shift cannot be seen."
+        yield "Places of masks are relative to the first one; a common shift cannot be seen."

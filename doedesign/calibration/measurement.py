@@ -77,19 +77,19 @@ class ImageSpec(SpecTable, frozen=True):
         depth_sigma_m: how well the depth is known.
         incident: counts per second of all light on the clear aperture, where that was measured; without it only the
             image's shape counts.
-        incident_sigma: its relative standard deviation.
+        incident_sigma: relative standard deviation of `incident`.
     """
 
     depth_m: FarDepth = Field(examples=['"10 cm"'])
     files: tuple[str, ...] = Field(min_length=1, examples=['["near_1ms.tiff", "near_10ms.tiff"]'])
-    exposures: tuple[Exposure, ...] = ()
-    name: str = ""
-    dark: tuple[str, ...] = ()
+    exposures: tuple[Exposure, ...] = Field((), examples=['["1 ms", "10 ms"]'])
+    name: str = Field("", examples=['"near"'])
+    dark: tuple[str, ...] = Field((), examples=['["dark_1ms.tiff", "dark_10ms.tiff"]'])
     dark_frames: Annotated[int, Field(strict=True, ge=1)] = 1
-    black_level: Annotated[float, Field(strict=True, ge=0)] | None = None
-    centre: tuple[float, float] | None = None
+    black_level: Annotated[float, Field(strict=True, ge=0)] | None = Field(None, examples=["64"])
+    centre: tuple[float, float] | None = Field(None, examples=["[512.5, 640.0]"])
     depth_sigma_m: Annotated[float, length(0.0, 10.0)] = 0.0
-    incident: Positive | None = None
+    incident: Positive | None = Field(None, examples=["2.5e7"])
     incident_sigma: Share = 0.02
 
     @property
@@ -102,20 +102,20 @@ _TURNED, _STRETCHED, _BENT = math.radians(10), 0.1, 2.0  # the most that a camer
 
 
 class CameraSpec(SpecTable, frozen=True):
-    """How the camera stood, as far as it is known (`doedesign.calibration.geometry`): `[camera]`.
+    """How the camera stood, as far as it is known (`doedesign.calibration.geometry`).
 
     What has a standard deviation is looked for; one of 0 says that the value is known. All zeros are an exact bench,
     which costs least.
 
     Attributes:
         rotation_rad: angle by which the camera is turned from the plate's +x toward its +y.
-        rotation_sigma_rad: its standard deviation.
+        rotation_sigma_rad: standard deviation of `rotation`.
         scale_y: share by which more of the light falls on a pixel's height than pixel pitch and focal length say.
-        scale_x: the same for its width.
-        scale_sigma: standard deviation of both.
-        distortion: k where light that belongs r from the chief ray lies at r (1 + k r²/d²), d being the lens's distance
-            from the sensor; beside the distortion of the design's lens.
-        distortion_sigma: its standard deviation.
+        scale_x: the same for a pixel's width.
+        scale_sigma: standard deviation of `scale_y` and `scale_x`.
+        distortion: number k where light that belongs r from the chief ray lies at r (1 + k r²/d²), d being the lens's
+            distance from the sensor; beside the distortion of the design's lens.
+        distortion_sigma: standard deviation of `distortion`.
     """
 
     rotation_rad: Annotated[float, bounded("rad", -_TURNED, _TURNED)] = 0.0
@@ -160,9 +160,9 @@ class MeasurementSpec(SpecTable, frozen=True):
     gain: Positive = Field(examples=["2.1"])
     read_noise: Annotated[float, Field(strict=True, ge=0)] = Field(examples=["2.5"])
     image: tuple[ImageSpec, ...] = Field(min_length=1)
-    window: Annotated[int, Field(strict=True, ge=16, le=8192)] | None = None
-    fill_factor: Share | None = None
-    saturation: Positive | None = None
+    window: Annotated[int, Field(strict=True, ge=16, le=8192)] | None = Field(None, examples=["256"])
+    fill_factor: Share | None = Field(None, examples=["0.9"])
+    saturation: Positive | None = Field(None, examples=["4095"])
     channel: Channel | None = None
     allow_8bit: bool = False
     quarter_turns: Literal[0, 1, 2, 3] = 0

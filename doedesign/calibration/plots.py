@@ -47,7 +47,8 @@ def plot_fitted_psfs(result: "Calibration", ax: "Axes | None" = None) -> "Figure
         "measured and model: logarithmic, background taken off, in units of the model's light in the window; "
         "difference: measured - model in standard deviations of the noise; grey: no usable pixel"
     )
-    with panels(ax, (3 * _SIDE + 1.9, count * (_SIDE + 0.55) + 0.5), note=words) as figure:
+    size = (3 * _SIDE + 1.9, count * (_SIDE + 0.55) + 0.85)
+    with panels(ax, size, "Measured PSFs beside those of the plate that was found", words) as figure:
         for index, row in enumerate(figure.subplots(count, 3, squeeze=False)):
             _draw_image(figure, row, result, index)
     return figure
@@ -107,7 +108,7 @@ def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBa
         "grey: prior, one standard deviation; bar: posterior, one standard deviation; hollow: not determined by the "
         "images"
     )
-    with panels(ax, (7.8 + height, height + 1.2), note=words) as figure:
+    with panels(ax, (7.8 + height, height + 1.55), "Errors that explain the measured PSFs", words) as figure:
         errors, correlation = figure.subplots(1, 2, width_ratios=(3.6, height))
         rows = _name_rows(errors, result.rows)
         centre, spread = (values - mean) / prior, sigma / prior
@@ -138,7 +139,7 @@ def plot_check(result: "Calibration", ax: "Axes | None" = None) -> "FigureBase":
         "chi2 per pixel of every image in the fit and as predicted from the other images; right: numbers read off "
         "the images against the model's (zero), bar: noise, shade: uncertainty of the model"
     )
-    with panels(ax, (9.9, 3.5), note=words) as figure:
+    with panels(ax, (9.9, 3.85), "Does the plate that was found explain the images?", words) as figure:
         residuals, images, readings = figure.subplots(1, 3, width_ratios=(2.4, 1.7, 2.0))
         _draw_residuals(residuals, result)
         _draw_left_out(images, result)

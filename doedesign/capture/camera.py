@@ -68,15 +68,37 @@ class CaptureModel:
         camera, psf = self.camera, jnp.stack([jnp.asarray(far), jnp.asarray(near)])
         return Optics(psf, camera.aperture_m, camera.sensor_distance_m, camera.pixel_m, self.shadow_px)
 
+    def clear(self, scene: Scene, far: Psf, near: Psf) -> Float[Array, "c y x"]:
+        """Light on the sensor without noise and without the obstruction of the scene."""
+        return self._light(_without(scene), far, near, self.outside)
+
+    def kept(self, scene: Scene, far: Psf, near: Psf) -> Float[Array, "c y x"]:
+        """Share of even light that gets past the one obstruction of a scene."""
+        (near_by,) = scene.obstructions
+        even = jnp.ones_like(scene.background)
+        black = Obstruction(near_by.mask, jnp.zeros_like(even), near_by.depth_m)
+        dark = Scene(even, scene.background_depth_m, (black,))
+        # Of eq. 10, too, nothing but the light behind the obstruction is to be seen.
+        passed, whole = (self._light(one, far, near, "nothing") for one in (dark, _without(dark)))
+        return passed / whole
+
+    def _light(self, scene: Scene, far: Psf, near: Psf, outside: Outside) -> Float[Array, "c y x"]:
+        return capture(scene, self.optics(far, near), self.occlusion, border=self.border, outside=outside)
+
     def developed(self, scene: Scene, far: Psf, near: Psf, key: Key[Array, ""]) -> Float[Array, "c y x"]:
         """Photograph one obstruction before a background, with the PSFs of both, in the colours of the camera.
 
         The result is linear light with noise, white 1. Differentiable, but for a mosaic.
         """
-        optics = self.optics(far, near)
-        light = capture(scene, optics, self.occlusion, border=self.border, outside=self.outside)
+        light = self._light(scene, far, near, self.outside)
         raw: Any = expose(light, self.sensor, key)
         return developed(demosaiced(np.asarray(raw), self.sensor) if self.sensor.pattern else raw, self.sensor)
+
+
+def _without(scene: Scene) -> Scene:
+    """The scene with nothing where its obstruction was."""
+    (near,) = scene.obstructions
+    return Scene(scene.background, scene.background_depth_m, (Obstruction(0 * near.mask, near.radiance, near.depth_m),))
 
 
 def depth_range_m(kind: Any) -> tuple[float, float]:
@@ -84,5 +106,5 @@ def depth_range_m(kind: Any) -> tuple[float, float]:
     depth = getattr(kind, "depth_m", None)
     if depth:
         return float(depth[0]), float(depth[1])
-    inner = [depth_range_m(getattr(kind, name)) for name in ("dirt", "raindrop")]
+    inner = [depth_range_m(getattr(kind, name)) for name in ("dirt", "raindrop", "fence") if hasattr(kind, name)]
     return min(low for low, _ in inner), max(high for _, high in inner)

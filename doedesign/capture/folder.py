@@ -282,7 +282,8 @@ def _words(model: CaptureModel, settings: dict[str, Any]) -> str:
         if sensor.noise == "physical"
         else f"noise model {sensor.noise}"
     )
-    caution = "" if follows_light(model.occlusion) else " (passes light that never reaches the aperture: see README)"
+    where = "see docs/explanation/occlusion.md"
+    caution = "" if follows_light(model.occlusion) else f" (passes light that never reaches the aperture: {where})"
     return (
         f"occlusion model {model.occlusion}{caution}; {settings['plate']}; {noise}; the conventional camera has a flat "
         "plate of the same glass; captures are developed and shown as sRGB, without gain"

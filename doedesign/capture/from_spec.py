@@ -7,6 +7,7 @@ A spec may leave all of it out but the occlusion model, which has no default: th
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, asdict, fields, is_dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
@@ -87,7 +88,8 @@ def obstruction_from_spec(
 
     Its distance is that of the spec's options, which hold for its own kind; otherwise it lies between the nearest and
     the farthest of the near depths, for which the DOE was designed (`near_m` without a spec); otherwise it is the usual
-    one of the kind. A folder of masks may lie beside the spec's file (`source`).
+    one of the kind. A folder of masks may lie beside the spec's file (`source`). Options of a kind that others are
+    mixed in begin with the name of the one that they are for, such as `dirt_clump`.
 
     Raises:
         InputError: no kind, an unknown one, or options that are not the kind's.
@@ -110,33 +112,54 @@ def obstruction_from_spec(
     if "folder" in parameters:
         beside = Path(source).parent / str(parameters["folder"])
         parameters["folder"] = str(beside if beside.is_dir() else parameters["folder"])
+    made = _made(kind, parameters, where)
+    near = near_m if spec is None else spec.scene.near_m
+    return at_depth(made, (min(near), max(near)), options) if near else made
+
+
+def _made(kind: Any, parameters: Mapping[str, Any], where: str) -> Any:
+    """A kind with parameters in SI, whose mistakes name the options' place."""
     try:
-        made = kind(**parameters)
+        return kind(**parameters)
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.rule, error.got, error.cure) from error
     except TypeError as error:  # a parameter without which there is nothing
         raise InputError(where, "must hold all that the kind needs", f'"{error}"', "Add it.") from error
-    near = near_m if spec is None else spec.scene.near_m
-    return _at_depth(made, (min(near), max(near))) if near and "depth_m" not in parameters else made
 
 
-def _at_depth(kind: Any, depth_m: tuple[float, float]) -> Any:
-    """The same kind of obstruction, or both that it is mixed of, at another distance."""
+def at_depth(
+    kind: Any, depth_m: tuple[float, float], options: Mapping[str, Any] = MappingProxyType({}), within: str = ""
+) -> Any:
+    """The same kind of obstruction, or all that it is mixed of, at distances from and to (`depth_m`, metres).
+
+    Where the options of a spec give a distance, that stays; those of a part begin with its name (`within`).
+    """
     names = {field.name for field in fields(kind)}
     if "depth_m" in names:
-        return replace(kind, depth_m=depth_m)
-    inner = {name: _at_depth(getattr(kind, name), depth_m) for name in names if is_dataclass(getattr(kind, name))}
-    return replace(kind, **inner)
+        return kind if f"{within}depth" in options else replace(kind, depth_m=depth_m)
+    parts = {name: getattr(kind, name) for name in names if is_dataclass(getattr(kind, name))}
+    return replace(kind, **{name: at_depth(part, depth_m, options, f"{name}_") for name, part in parts.items()})
 
 
 def _parameters(kind: type[ObstructionKind], options: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Options of a spec as parameters in SI."""
-    known = {f.name.removesuffix("_m").removesuffix("_rad"): f for f in fields(cast("Any", kind)) if f.init}
-    found = {}
+    """Options of a spec as parameters in SI; those that begin with the name of a part of a mixed kind make that."""
+    own = [field for field in fields(cast("Any", kind)) if field.init]
+    parts = {f.name: f.default_factory for f in own if is_dataclass(f.default_factory)}
+    known = {f.name.removesuffix("_m").removesuffix("_rad"): f for f in own if f.name not in parts}
+    found: dict[str, Any] = {}
+    inner: dict[str, dict[str, Any]] = {}
     for key, value in options.items():
-        if key not in known:
+        part = next((name for name in parts if key not in known and key.startswith(f"{name}_")), None)
+        if part is not None:
+            inner.setdefault(part, {})[key.removeprefix(f"{part}_")] = value
+        elif key in known:
+            found[known[key].name] = _parameter(known[key], value, f"{where}.{key}")
+        else:
             raise InputError(where, "must be parameters of this kind", f"`{key}`", nearest(key, tuple(known)))
-        found[known[key].name] = _parameter(known[key], value, f"{where}.{key}")
+    for part, given in inner.items():
+        of_part = cast("type[ObstructionKind]", parts[part])
+        beside = f"{where} of {part}"
+        found[part] = _made(of_part, _parameters(of_part, given, beside), beside)
     return found
 
 

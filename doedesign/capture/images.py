@@ -159,6 +159,25 @@ def crop(
     return np.ascontiguousarray(window[:, ::-1] if mirror else window)
 
 
+def zoomed(
+    picture: Picture, shape: tuple[int, int], share: float, place: tuple[float, float], mirror: bool = False
+) -> UInt8[np.ndarray, "v u 3"]:
+    """Cut a window of a share of the picture out of it, and bring it to `shape` (y, x) pixels.
+
+    A share of 1 is the largest window of this shape that fits, so of a square one the picture's shorter side. The
+    bicubic kernel grows with the step, so that what is shrunk does not alias; `place` is that of `crop`.
+    """
+    from PIL import Image
+
+    step = share * min(m / n for n, m in zip(shape, picture.shape[:2], strict=True))
+    sides = [step * n for n in shape]
+    y, x = (at * (m - side) for at, side, m in zip(place, sides, picture.shape[:2], strict=True))
+    box = (x, y, min(x + sides[1], picture.shape[1]), min(y + sides[0], picture.shape[0]))
+    shown = Image.fromarray(picture).resize((shape[1], shape[0]), Image.Resampling.BICUBIC, box=box)
+    window = np.asarray(shown, np.uint8)
+    return np.ascontiguousarray(window[:, ::-1] if mirror else window)
+
+
 def display_values(picture: np.ndarray) -> Picture:
     """An array `[y, x, 3]` of display values, uint8 or floats from 0 to 1, as a picture.
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from doedesign.capture.images import Picture, Pictures, crop, linear_light
+from doedesign.capture.images import Picture, Pictures, crop, linear_light, zoomed
 from fab.errors import InputError
 from sim.imaging.scene import Scene
 from sim.obstruction import CameraView, ObstructionKind
@@ -55,6 +55,7 @@ class SceneData:
         workers: threads.
         ahead: batches that are prepared before they are asked for.
         mirrored: whether pictures are exchanged left and right at random.
+        zoom: least and greatest share of a picture that a scene shows, see `draw_scene`; None for pixels as they are.
     """
 
     pictures: Pictures
@@ -66,6 +67,7 @@ class SceneData:
     workers: int = 2
     ahead: int = 4
     mirrored: bool = True
+    zoom: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for counts below one, distances out of order, or no pictures."""
@@ -74,6 +76,8 @@ class SceneData:
                 raise ValueError(f"`{name}` must be at least 1, but got {getattr(self, name)}")
         if not 0 < self.far_m[0] <= self.far_m[1]:
             raise ValueError(f"`far_m` must rise from above 0, but got {self.far_m}")
+        if self.zoom is not None and not 0 < self.zoom[0] <= self.zoom[1] <= 1:
+            raise ValueError(f"`zoom` must rise from above 0 to at most 1, but got {self.zoom}")
         if not len(self.pictures):
             raise ValueError("`pictures` must hold one, but got none")
 
@@ -87,7 +91,8 @@ class SceneData:
         name, picture = self._picture(epoch, index)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(epoch, index)))
         try:
-            return NamedScene(name, draw_scene(picture, self.kind, self.view, self.far_m, rng, self.mirrored))
+            scene = draw_scene(picture, self.kind, self.view, self.far_m, rng, self.mirrored, self.zoom)
+            return NamedScene(name, scene)
         except Exception as error:
             error.add_note(f"while preparing scene {index} of epoch {epoch} from {name}")
             raise
@@ -114,15 +119,23 @@ def draw_scene(
     far_m: tuple[float, float],
     rng: np.random.Generator,
     mirrored: bool = False,
+    zoom: tuple[float, float] | None = None,
 ) -> Scene:
     """Put a crop of a picture behind an obstruction, at a place, at depths and of a shape that are drawn.
 
     A picture in which the frame does not fit is enlarged; the background's depth is drawn evenly in 1/z from `far_m`,
-    and, if `mirrored`, left and right are exchanged at random.
+    and, if `mirrored`, left and right are exchanged at random. With a `zoom` the crop is not of the frame's pixels but
+    of a share of the picture's shorter side, which is drawn evenly in its logarithm from this range and brought to the
+    frame's pixels (`doedesign.capture.images.zoomed`): near and distant views of the same thing.
     """
     place, mirror = (rng.uniform(), rng.uniform()), bool(rng.integers(2)) and mirrored
     far = 1 / rng.uniform(1 / far_m[1], 1 / far_m[0]) if far_m[0] < far_m[1] else far_m[0]
-    background = linear_light(crop(picture, view.shape, place, mirror))
+    if zoom is None:
+        shown = crop(picture, view.shape, place, mirror)
+    else:
+        share = float(zoom[0] * (zoom[1] / zoom[0]) ** rng.uniform())
+        shown = zoomed(picture, view.shape, share, place, mirror)
+    background = linear_light(shown)
     return Scene(background, float(far), (kind.draw(rng, view, background),))
 
 

@@ -92,8 +92,8 @@ class SimulatedCapture:
         pictures = {"scene": self.clean, "conventional camera": self.conventional, "camera with the DOE": self.doe}
         near, far = length_text(self.depth_near_m), length_text(self.depth_far_m)
         covered = 100 * self.mask.mean(dtype=np.float64)
-        words = f"{self.name}: {covered:.0f} % covered at {near}, scene at {far}; occlusion model {self.occlusion}"
-        with panels(ax, (10.0, 2.5 * y / x + 0.9), note=words, layout="compressed") as figure:
+        words = f"{covered:.0f} % covered at {near}, scene at {far}; occlusion model {self.occlusion}"
+        with panels(ax, (10.0, 2.5 * y / x + 1.2), self.name, words, layout="compressed") as figure:
             *shown, last = figure.subplots(1, 4)
             for axes, (title, light) in zip(shown, pictures.items(), strict=True):
                 display = np.broadcast_to(np.clip(srgb_from_linear(self.rgb(light)), 0, 1), (3, y, x))

@@ -11,7 +11,7 @@ from typing import Any
 
 from cyclopts import CycloptsError
 
-from doedesign.cli.options import in_options
+from doedesign.cli.options import in_options, words_in_options
 from doedesign.runtime.stopping import interruptible
 from fab.errors import CheckFailed, InputError, printable
 
@@ -25,7 +25,8 @@ class _Stderr(logging.Handler):
     """Show records of the library: plain lines, warnings as such."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        say(f"warning: {record.getMessage()}" if record.levelno >= logging.WARNING else record.getMessage())
+        text = words_in_options(record.getMessage())
+        say(f"warning: {text}" if record.levelno >= logging.WARNING else text)
 
 
 @contextlib.contextmanager

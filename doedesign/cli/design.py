@@ -1,9 +1,11 @@
 """From a spec to a design and its masks: new, optimize, refine, precompensate, masks, verify."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any, Literal
 
+from doedesign.cli.closing import say_closing, words_to_draw
 from doedesign.cli.console import print_paths, print_results, print_text, say
 from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
@@ -32,6 +34,7 @@ def new(name: str | None = None, *, out: Path | None = None, json_: AsJson = Fal
         raise InputError(str(path), "a new spec must not replace a file", "a file of that name", "Give another --out.")
     write_atomic(path, text.encode())
     print_paths([path], json_)
+    say(f"next: doedesign {shlex.join(['optimize', str(path)])}")
 
 
 def optimize(
@@ -58,6 +61,7 @@ def optimize(
     from doedesign.design.objectives import import_objectives
     from doedesign.optimization import optimize as work
     from doedesign.optimization import steps_within
+    from doedesign.runs.costs import measured
     from doedesign.spec import load_spec
 
     if start is not None:
@@ -65,10 +69,12 @@ def optimize(
     read = load_spec(spec, set_)
     folder = out or Path("runs") / read.name
     own = import_objectives(read) if allow_code else None
-    if budget is not None:
-        set_ = (*set_, f"optimize.steps={steps_within(read, budget, None if overwrite else folder, own)}")
-    work(spec, folder, overrides=set_, objectives=own, overwrite=overwrite)
+    with measured(folder, "optimize") as taken:
+        if budget is not None:
+            set_ = (*set_, f"optimize.steps={steps_within(read, budget, None if overwrite else folder, own)}")
+        work(spec, folder, overrides=set_, objectives=own, overwrite=overwrite)
     print_paths([folder], json_, metrics=str(folder / "metrics.json"))
+    say_closing(folder, taken=taken)
 
 
 def refine(
@@ -93,9 +99,12 @@ def refine(
         overwrite: Where the folder has another run, remove it and all that was made of it.
     """
     from doedesign.refinement import refine as work
+    from doedesign.runs.costs import measured
 
-    folder = work(run, out, terms=terms, steps=steps, overwrite=overwrite).folder or Path()
+    with measured(out, "refine") as taken:
+        folder = taken.run = work(run, out, terms=terms, steps=steps, overwrite=overwrite).folder or Path()
     print_paths([folder], json_, metrics=str(folder / "metrics.json"))
+    say_closing(folder, taken=taken)
 
 
 def precompensate(
@@ -103,7 +112,7 @@ def precompensate(
     *,
     process: str | None = None,
     random: Texts = (),
-    by: Literal["loss", "psfs"] = "loss",
+    by: Literal["psfs", "loss"] | None = None,
     evaluations: int = 120,
     out: Path | None = None,
     allow_code: Flag = False,
@@ -119,7 +128,8 @@ def precompensate(
         process: TOML file with a [process] table, such as process-estimate.toml of a calibration, or the name of a
             stock process; the run's own by default.
         random: Errors that are drawn anew for every plate, such as overlay; they are those of the run's own process.
-        by: The least loss of the spec's objectives, or the least difference of the PSFs from the design's.
+        by: The least difference of the PSFs from the design's, or the least loss of the spec, which may be less than
+            the design's own, with another light; by default psfs, but for spots, areas and foci loss.
         evaluations: Plates of the search; 0 only undoes the mean errors of depth and line width.
         out: Folder of the new run; runs/NAME_v2 by default.
         allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
@@ -127,13 +137,16 @@ def precompensate(
     """
     from doedesign.design.objectives import import_objectives
     from doedesign.precompensation import precompensate as work
+    from doedesign.runs.costs import measured
     from doedesign.runs.folder import open_run
 
     source = open_run(run)
     own = import_objectives(source.spec) if allow_code else None
     settings: dict[str, Any] = {"random": random, "by": by, "objectives": own, "evaluations": evaluations}
-    folder = work(source, out, process=process, **settings, overwrite=overwrite).folder or Path()
+    with measured(out, "precompensate") as taken:
+        folder = taken.run = work(source, out, process=process, **settings, overwrite=overwrite).folder or Path()
     print_paths([folder], json_, table=str(folder / "precompensation.csv"))
+    say_closing(folder, taken=taken)
 
 
 def masks(
@@ -152,13 +165,14 @@ def masks(
     mesh_patch: str | None = None,
     as_built: Path | None = None,
     order: Path | None = None,
-    process: Path | None = None,
+    process: str | None = None,
     wafer: Path | None = None,
     terms: Path | None = None,
     direct_write: Flag = False,
     plates: Literal["gds.gz", "gds"] = "gds.gz",
     combined_gds: Flag = False,
     mesh_cells: int = 200,
+    overwrite: Flag = False,
     json_: AsJson = False,
 ) -> None:
     """Write the mask order of a run or of any height map, and prove it by reading it back.
@@ -181,14 +195,18 @@ def masks(
         mesh_patch: Also write a window of the relief as a mesh alone, up to 1000 x 1000 pixels.
         as_built: JSON of the run sheet with measured numbers filled in.
         order: With --as-built, the order that was made; masks/NAME by default.
-        process: A TOML file with another [process] table; with --as-built, for what was not measured.
+        process: A TOML file with another [process] table, or the name of a stock process; with --as-built, for what was
+            not measured.
         wafer: A TOML file with another [wafer] table.
         terms: A TOML file with another [order] table, what a mask shop is asked for.
         direct_write: Also write one layer per level, merged, as OASIS and DXF, and a table of doses.
         plates: Files of the photomasks: GDSII packed by gzip, or plain.
         combined_gds: Write the layout of all layers as GDSII, too, and not only as OASIS.
         mesh_cells: Most columns of the mesh of the whole relief along x and y, up to 1000.
+        overwrite: Where the folder has the order of another design, replace that order.
     """
+    from doedesign.runs.costs import measured
+
     if as_built is not None:
         for option, given in (("--wafer", wafer), ("--terms", terms)):
             if given is not None:
@@ -197,34 +215,41 @@ def masks(
         from doedesign.lab.as_built import as_built as predict
 
         folder = source / "as-built"
-        predict(source, as_built, order, process=process, out=folder)
+        with measured(source, "masks") as taken:
+            predict(source, as_built, order, process=process, out=folder)
         print_results(folder, json_)
+        say_closing(folder, source, taken)
         return
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
     from doedesign.lab.order import PROBE_M, drawn_as, write_masks
     from fab.order.formats import Formats
 
-    done = write_masks(
-        source,
-        out,
-        levels=levels,
-        on_violation=on_violation,
-        probe_m=length_of("--probe", probe) or PROBE_M,
-        patch=_patch(patch, mesh_patch),
-        formats=Formats(plates, combined_gds, mesh_cells),
-        process=process,
-        wafer=wafer,
-        terms=terms,
-        direct_write=direct_write,
-        step_m=length_of("--step", step),
-        etch_depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
-        pitch_m=length_of("--pitch", pitch),
-        scale_m=length_of("--scale", scale),
-        aperture_m=_aperture(aperture),
-    )
+    with measured(source if source.is_dir() else None, "masks", writes=out or Path("masks")) as taken:
+        done = write_masks(
+            source,
+            out,
+            levels=levels,
+            on_violation=on_violation,
+            probe_m=length_of("--probe", probe) or PROBE_M,
+            patch=_patch(patch, mesh_patch),
+            formats=Formats(plates, combined_gds, mesh_cells),
+            overwrite=overwrite,
+            process=process,
+            wafer=wafer,
+            terms=terms,
+            direct_write=direct_write,
+            step_m=length_of("--step", step),
+            etch_depths_m=[
+                length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth
+            ],
+            pitch_m=length_of("--pitch", pitch),
+            scale_m=length_of("--scale", scale),
+            aperture_m=_aperture(aperture),
+        )
     say(f"{len(done.report.checks)} checks passed: every pixel of every file is {drawn_as(done)}")
     print_results(done.folder, json_, checks=len(done.report.checks))
+    say_closing(done.folder, source if source.is_dir() else None, taken)
 
 
 def _aperture(text: str | None) -> list[float] | str | None:
@@ -245,6 +270,7 @@ def verify(order: Path, *, json_: AsJson = False) -> None:
     """
     from fab.order.verify import verify as work
 
+    _require_order(order)
     report = work(order)
     if json_:
         checks = [{"file": c.file, "question": c.question, "problems": list(c.problems)} for c in report.checks]
@@ -253,6 +279,23 @@ def verify(order: Path, *, json_: AsJson = False) -> None:
     for note in report.notes:
         say(note)
     say(f"{len(report.checks)} checks passed")
+    say_closing(order)
+
+
+def _require_order(folder: Path) -> None:
+    """Refuse a run where its mask order is wanted, and propose that."""
+    from doedesign.overview.kinds import record_of
+    from doedesign.runs.orders import is_made_from, order_of_run, own_level_map
+    from fab.files import MANIFEST_NAME
+
+    record = record_of(folder) if (folder / MANIFEST_NAME).is_file() else None
+    if record is None or record.kind not in ("run", "training", "released model"):
+        return
+    own = own_level_map(folder)
+    place = order_of_run(record.name, folder, own)
+    draw = f"Draw its order first: doedesign {shlex.join(words_to_draw(record.name, folder))}."
+    cure = f"Give its order: {place}." if own is not None and is_made_from(place, own) else draw
+    raise InputError(str(folder), "must be the folder of a mask order", "a run", cure)
 
 
 def _patch(step: str | None, mesh: str | None) -> Any:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from doedesign.cli.closing import say_closing
 from doedesign.cli.console import print_paths, print_results
 from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
@@ -17,7 +18,7 @@ def psf(
     depths: Texts = (),
     field_deg: Annotated[tuple[float, float], Parameter(negative="")] = (0.0, 0.0),
     fabricated: Flag = False,
-    process: Path | None = None,
+    process: str | None = None,
     variation: Path | None = None,
     seed: int | None = None,
     draw: str = "normal/0",
@@ -34,11 +35,13 @@ def psf(
         depths: Source depths, such as "5 cm" or inf; the spec's by default.
         field_deg: Field angles along y and x in degrees.
         fabricated: Predict a plate as fabricated, into RUN/fabricated.
-        process: TOML file with a [process] table; the run's own by default.
+        process: TOML file with a [process] table, or the name of a stock process; the run's own by default.
         variation: TOML file with the errors of the plate.
         seed: Draw the errors of the plate from the process.
         draw: Which draw of the seed, as in a tolerance study.
     """
+    from doedesign.runs.costs import measured
+
     if fabricated:
         if depths or any(field_deg):
             option = "--depths" if depths else "--field-deg"
@@ -47,8 +50,10 @@ def psf(
         from doedesign.runs.fabricated import fabricated as predict
 
         folder = run / "fabricated"
-        predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, out=folder)
+        with measured(run, "psf") as taken:
+            predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, out=folder)
         print_results(folder, json_)
+        say_closing(folder, run, taken)
         return
     if process is not None or variation is not None or seed is not None:
         raise InputError("--fabricated", "must be given with --process, --variation or --seed", "not there", "Add it.")
@@ -62,8 +67,10 @@ def psf(
     if not all(abs(angle) <= 60 for angle in field_deg):
         raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
     folder = run / "psf"
-    psfs(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), folder)
+    with measured(run, "psf") as taken:
+        psfs(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), folder)
     print_results(folder, json_)
+    say_closing(folder, run, taken)
 
 
 def certify(
@@ -88,10 +95,13 @@ def certify(
         side: Cells of a square's side, 2 to 4; time grows with their sixth power.
     """
     from doedesign.runs.certificate import certify as prove
+    from doedesign.runs.costs import measured
 
     folder = run / "certificate"
-    prove(run, masks, cells=cells, pieces=pieces, side=side, out=folder)
+    with measured(run, "certify") as taken:
+        prove(run, masks, cells=cells, pieces=pieces, side=side, out=folder)
     print_results(folder, json_)
+    say_closing(folder, run, taken)
 
 
 def simulate(
@@ -105,7 +115,7 @@ def simulate(
     seed: int = 0,
     size: int | None = None,
     fabricated: Flag = False,
-    process: Path | None = None,
+    process: str | None = None,
     variation: Path | None = None,
     plate_seed: int | None = None,
     draw: str = "normal/0",
@@ -128,7 +138,8 @@ def simulate(
         seed: Seed of everything.
         size: Binned pixels per side of a frame; 512 by default, or what the sensor has.
         fabricated: Look through a plate with errors: those of --variation, of --plate-seed, or the process's means.
-        process: With --fabricated, a TOML file with a [process] table; the run's own by default.
+        process: With --fabricated, a TOML file with a [process] table, or the name of a stock process; the run's own by
+            default.
         variation: With --fabricated, a TOML file with the errors of the plate.
         plate_seed: With --fabricated, draw the errors of the plate from the process.
         draw: With --plate-seed, which draw, as in a tolerance study.
@@ -139,6 +150,7 @@ def simulate(
         rule = "must be given with --process, --variation or --plate-seed"
         raise InputError("--fabricated", rule, "not there", "Add it.")
     from doedesign.capture.folder import PlateErrors, simulate_files
+    from doedesign.runs.costs import measured
     from doedesign.runs.level_maps import open_design
 
     design, plate = open_design(run, masks, overrides=set_), None
@@ -146,6 +158,9 @@ def simulate(
         made_by = design.process(process)
         plate = PlateErrors(made_by, *design.plate_errors(made_by, variation, plate_seed, draw))
     how = {"obstruction": obstruction, "occlusion": occlusion, "count": count, "seed": seed, "size": size, "png": png}
-    done = simulate_files(design, out or run / "simulated", images, plate=plate, **how)
+    folder = out or run / "simulated"
+    with measured(run, "simulate", writes=folder) as taken:
+        done = simulate_files(design, folder, images, plate=plate, **how)
     paths = [done.folder, *(done.folder / name for name in ("contact.png", "manifest.json", *done.items))]
     print_paths(paths, json_, items=list(done.items), skipped=done.skipped)
+    say_closing(done.folder, run, taken)

@@ -1,17 +1,21 @@
-"""The reconstruction network: train, finetune, reconstruct."""
+"""The reconstruction network: train, finetune, reconstruct, evaluate."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from doedesign.cli.closing import say_closing
 from doedesign.cli.console import print_paths, print_results
-from doedesign.cli.options import AsJson, Flag, Overrides, length_of
+from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
 
 if TYPE_CHECKING:
     from doedesign.recon.model import Model, PsfPair
+
+log = logging.getLogger("doedesign")
 
 Files = Annotated[tuple[Path, ...], Parameter(negative="", show_default=False)]
 PsfFiles = Annotated[
@@ -67,6 +71,7 @@ def train(
         hosts: Number of hosts; each runs this command, and all see the same folders.
         host: Number of this host, from 0.
     """
+    from doedesign.runs.costs import measured
     from doedesign.runs.folder import TRAINING_TABLES
     from doedesign.runs.level_maps import open_design
     from doedesign.training.train import train as work
@@ -77,8 +82,10 @@ def train(
     how: Any = {"occlusion": occlusion, "obstruction": obstruction, "licence": licence, "tensorboard": tensorboard}
     how |= {"validation": validation, "lpips_weights": lpips_weights, "overrides": set_, **several}
     folder = out or run / "trained"
-    work(design, images, folder, **how)
+    with measured(run, "train", writes=folder) as taken:
+        work(design, images, folder, **how)
     print_results(folder, json_, metrics=str(folder / "metrics.json"))
+    say_closing(folder, run, taken)
 
 
 def finetune(
@@ -117,13 +124,16 @@ def finetune(
         mirror: Exchange left and right at random, of captures and PSFs.
     """
     from doedesign.recon.model import Model
+    from doedesign.runs.costs import measured
     from doedesign.training.finetune import finetune as work
 
     folder, model = out or run / "finetuned", Model.open(run)
     how: Any = {"steps": steps, "learning_rate": learning_rate, "seed": seed, "validation": validation, "size": size}
     how |= {"lpips_weights": lpips_weights, "linear": linear, "mirrored": mirror}
-    work(model, pairs, folder, psfs=_psfs(model, psf, pixel, near_depth, far_depth), **how)
+    with measured(run, "finetune", writes=folder) as taken:
+        work(model, pairs, folder, psfs=_psfs(model, psf, pixel, near_depth, far_depth), **how)
     print_results(folder, json_, metrics=str(folder / "metrics.json"))
+    say_closing(folder, run, taken)
 
 
 def reconstruct(
@@ -157,6 +167,7 @@ def reconstruct(
     from doedesign.recon.files import reconstruct_files
     from doedesign.recon.model import Model
     from doedesign.recon.photos import PHOTO_FILES
+    from doedesign.runs.costs import measured
 
     first, *rest = captures
     alone = first.is_file() or (first.suffix.lower() in PHOTO_FILES and not first.is_dir())
@@ -165,7 +176,90 @@ def reconstruct(
     how: Any = {"tile": tile, "overlap": overlap, "linear": linear, "kind": ending, "beside": beside}
     given = {name: value for name, value in how.items() if value is not None}
     psfs = _psfs(model, psf, pixel, near_depth, far_depth)
-    print_paths(reconstruct_files(model, files, out or Path("reconstructed"), psfs=psfs, **given), json_)
+    folder = out or Path("reconstructed")
+    with measured(None if alone else first, "reconstruct", writes=folder) as taken:
+        paths = reconstruct_files(model, files, folder, psfs=psfs, **given)
+    print_paths(paths, json_)
+    say_closing(folder, None if alone else first, taken)
+
+
+def evaluate(
+    run: Path,
+    *,
+    table: int = 2,
+    figure: str | None = None,
+    occlusion: str | None = None,
+    obstruction: str | None = None,
+    pairs: int = 200,
+    images: Path | None = None,
+    test: Path | None = None,
+    licence: str | None = None,
+    train: Flag = False,
+    seeds: Annotated[tuple[int, ...], Parameter(negative="", consume_multiple=True)] = (0,),
+    seed: int = 0,
+    reflect: Flag = False,
+    robust: Path | None = None,
+    process: Path | None = None,
+    draws: int = 4,
+    method: Texts = (),
+    lpips_weights: Files = (),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    out: Path | None = None,
+    set_: Overrides = (),
+    json_: AsJson = False,
+) -> None:
+    """Score the rows of one of the paper's tables on the same captures: networks, cameras, single-image methods.
+
+    Writes the table as CSV, JSON, LaTeX and pictures. The same command goes on where it was stopped. With --figure,
+    one of its figures instead, of the design alone: numbers and a picture.
+
+    Args:
+        run: Run folder of a design, or the folder of a released model.
+        table: 1, networks and deconvolution behind the plate; or 2, other cameras and single-image methods.
+        figure: 4, PSFs and MTFs beside classic plates; 8, light against depth, as drawn and as fabricated; or bench,
+            photographs of a plate on the paper's PSF bench, for calibrate.
+        occlusion: radiometric, reciprocal, paper or paper_release; the spec's by default.
+        obstruction: Kind, such as dirt, raindrop or fence, or a folder of masks; the spec's by default.
+        pairs: Number of test pairs.
+        images: Folder of pictures to train on; some of scikit-image's sample pictures by default.
+        test: Folder of pictures to judge by, none of them trained on; the others of scikit-image's by default.
+        licence: Licence of the pictures to train on, for the record.
+        train: Train the networks that are missing, with the spec's [train]; otherwise their rows are left out.
+        seeds: Seeds of the trainings.
+        seed: Seed of the pairs.
+        reflect: Mirror scenes beyond the edges of a capture, as in training, instead of letting them go on.
+        robust: Run folder of a robust design of the same camera, for rows of its own in table 2.
+        process: TOML file with a [process] table for the plates as fabricated; the run's own by default.
+        draws: Plates as fabricated, over which the pairs are shared out.
+        method: A program to score, "NAME=COMMAND {in} {out}"; NAME:scene= or NAME:plate= shows it something else.
+        lpips_weights: Files with the weights of LPIPS; without them there is no such column.
+        workers: Worker processes; as many as cores and memory allow by default, 0 for this process.
+        scheduler: Address of a Dask scheduler whose workers are taken instead.
+        out: Folder; RUN/evaluation by default.
+    """
+    from doedesign.runs.costs import measured
+
+    folder = out or run / "evaluation"
+    if figure is not None:
+        from doedesign.evaluation.optics.figures import figure as draw
+
+        with measured(run, "evaluate", writes=folder) as taken:
+            drawn = draw(run, figure, folder, process=process, draws=draws, seed=seed)
+        print_results(drawn, json_)
+        say_closing(drawn, run, taken)
+        return
+    from doedesign.evaluation.evaluate import evaluate as work
+
+    how: Any = {"occlusion": occlusion, "obstruction": obstruction, "images": images, "test": test, "licence": licence}
+    how |= {"pairs": pairs, "train": train, "seeds": seeds, "seed": seed, "border": "reflect" if reflect else "own"}
+    how |= {"robust": robust, "process": process, "draws": draws, "methods": method, "lpips_weights": lpips_weights}
+    with measured(run, "evaluate", writes=folder) as taken:
+        found = work(run, folder, table=table, overrides=set_, workers=workers, scheduler=scheduler, **how)
+    log.info("%s", found.text())
+    place = folder / found.folder_name
+    print_results(place, json_, table=str(place / "table.csv"))
+    say_closing(place, run, taken)
 
 
 def _psfs(model: "Model", files: Sequence[Path], pixel: str | None, near: str | None, far: str | None) -> "PsfPair":

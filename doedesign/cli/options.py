@@ -71,7 +71,11 @@ _OPTIONS = {
     "or evaluate it alone.": "or see what it is with --draw.",
     "Give limits, such as": "Add [[limit]] to the spec, or --limit, such as",
     'Give a process with errors, such as "contact_aligner".': (
-        'Add stock = "contact_aligner" to [process], or give a file with such a table (--process).'
+        'Write stock = "contact_aligner" in [process], or give --process contact_aligner.'
+    ),
+    "add a zero layer of chrome marks": "add a zero layer of chrome marks (`[wafer] zero_layer = true`)",
+    "into a folder of their own: doedesign masks RUN.": (
+        "into a folder of their own: doedesign masks RUN --out masks/OTHER."
     ),
 }
 
@@ -88,6 +92,15 @@ def in_options(error: InputError, options: Collection[str] = ()) -> str:
     where = "depths_m" if error.where.startswith("depths_m: ") else error.where
     if where in _PLACES or where in options:
         text = _PLACES.get(where, f"--{where.replace('_', '-')}") + text.removeprefix(where)
+    return words_in_options(text)
+
+
+def words_in_options(text: str) -> str:
+    """Words of the library with command-line options and keys of a spec in place of its arguments.
+
+    Args:
+        text: a message.
+    """
     for words, option in _OPTIONS.items():
         text = text.replace(words, option)
     return text

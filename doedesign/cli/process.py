@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from doedesign.cli.closing import say_closing
 from doedesign.cli.console import print_results, print_text
 from doedesign.cli.options import AsJson, Flag, Texts, length_of
 from fab.errors import InputError
@@ -23,7 +24,7 @@ def tolerance(
     budget: str | None = None,
     yield_: Annotated[float, Parameter(name="--yield")] = 0.9,
     limit: Texts = (),
-    process: Path | None = None,
+    process: str | None = None,
     masks: Path | None = None,
     draw: str | None = None,
     workers: int | None = None,
@@ -43,7 +44,7 @@ def tolerance(
         budget: Errors for which the largest sigma is sought, such as overlay, overlay_x or overlay_x[3].
         yield_: Yield that the budget is for.
         limit: What a good plate obeys, such as "zeroth_order <= 5 %"; the spec's limits by default.
-        process: TOML file with a [process] table; the run's own by default.
+        process: TOML file with a [process] table, or the name of a stock process; the run's own by default.
         masks: Its mask order; masks/NAME by default.
         draw: Repeat a single plate, such as normal/17, and print its errors as TOML and its numbers.
         workers: Worker processes; as many as there are cores and memory for by default.
@@ -54,12 +55,15 @@ def tolerance(
     if draw is not None:
         print_text(_one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
         return
+    from doedesign.runs.costs import measured
     from doedesign.tolerancing.results import tolerance as study
 
     folder = out or run / "tolerance"
     settings |= {"draws": draws, "sensitivity": sensitivity, "sobol": sobol, "corners": corners, "budget": budget}
-    study(run, **settings, wanted=yield_, out=folder, workers=workers, scheduler=scheduler)
+    with measured(run, "tolerance", writes=folder) as taken:
+        study(run, **settings, wanted=yield_, out=folder, workers=workers, scheduler=scheduler)
     print_results(folder, json_, results=str(folder / "results.json"))
+    say_closing(folder, run, taken)
 
 
 def _one_draw(run: Path, key: str, as_json: bool, **settings: Any) -> str:
@@ -91,7 +95,7 @@ def calibrate(
     measurement: Path | None = None,
     *,
     errors: Texts = (),
-    process: Path | None = None,
+    process: str | None = None,
     masks: Path | None = None,
     evaluations: int = 60,
     polish: int = 0,
@@ -115,7 +119,8 @@ def calibrate(
         run: Run folder.
         measurement: TOML file that names the images and says how they were taken.
         errors: Errors to look for, such as depth, overlay_x or cd_bias[3]; by default depth, line width and overlay.
-        process: TOML file with a [process] table, whose errors are the prior; the run's own by default.
+        process: TOML file with a [process] table, or the name of a stock process, whose errors are the prior; the run's
+            own by default.
         masks: The run's mask order; masks/NAME by default.
         evaluations: Plates of the global search, which begins only if it is needed.
         polish: Steps along the exact gradient at the end.
@@ -133,14 +138,18 @@ def calibrate(
         got = "neither" if measurement is None else "both"
         cure = "Give the measurement's TOML file, or --ring-to-disc with --probe and --depth."
         raise InputError("calibrate", "must be given a measurement or a ring:disc ratio", got, cure)
+    from doedesign.runs.costs import measured
+
     if measurement is not None:
         from doedesign.calibration.estimate import calibrate as fit
 
         folder = out or run / "calibration"
         settings = {"process": process, "masks": masks, "evaluations": evaluations, "polish": polish, "seed": seed}
-        result = fit(run, measurement, errors, **settings, out=folder)
+        with measured(run, "calibrate", writes=folder) as taken:
+            result = fit(run, measurement, errors, **settings, out=folder)
         estimate = str(folder / "process-estimate.toml")
         print_results(folder, json_, estimate=estimate, explained=result.explained)
+        say_closing(folder, run, taken)
         return
     from doedesign.calibration.explanations import Targets, explain_ratio
 
@@ -158,5 +167,7 @@ def calibrate(
         raise InputError("--throughput-sigma, --reach", "must be positive", (throughput_sigma, reach), "Correct them.")
     targets = Targets(lengths["--probe"], lengths["--depth"], ring_to_disc or 0.0, throughput, throughput_sigma)
     folder = out or run / "explanations"
-    explain_ratio(run, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=folder)
+    with measured(run, "calibrate", writes=folder) as taken:
+        explain_ratio(run, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=folder)
     print_results(folder, json_)
+    say_closing(folder, run, taken)

@@ -7,8 +7,8 @@ Every entry is a relative difference, root sum of squares over that of the light
                 their open part instead of the part itself
     walls       of pixel energies, measured: what the light of walls changes; None where PSFs have it already, of which
                 `doedesign certify` proves what is left
-    lens        of pixel energies, measured: what a lens that images tangents changes where sines are in force, or one
-                that images sines where tangents are
+    lens_mapping   of pixel energies, measured: what a lens that images tangents changes where sines are in force, or
+                one that images sines where tangents are
 """
 
 from collections.abc import Sequence
@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fab.aperture import RoundAperture
 from sim.camera import Camera, Mapping, SpectralLine, path_at_m
 from sim.metrics import mean_wavelength_m
 from sim.optic import HeightOptic
@@ -39,7 +40,7 @@ class Accuracy(NamedTuple):
     numerics: float | None
     rim: float
     walls: float | None
-    lens: float | None
+    lens_mapping: float | None
 
 
 def accuracies(optic: HeightOptic | EdgeOptic, bank: PsfBank, depths_m: Sequence[float]) -> list[Accuracy]:
@@ -132,11 +133,11 @@ def in_words(found: Sequence[Accuracy], camera: Camera) -> str:
     parts = []
     if numerics := [one.numerics for one in found if one.numerics is not None]:
         parts.append(f"numerics {largest(numerics)}")
-    parts.append(f"cells on the rim {largest([one.rim for one in found])}")
+    rim = "the round rim" if isinstance(camera.opening, RoundAperture) else "the rim"
+    parts.append(f"square cells on {rim} {largest([one.rim for one in found])}")
     if walls := [one.walls for one in found if one.walls is not None]:
-        parts.append(f"walls left out {largest(walls)}")
-    words = {"sine": "f sin angle instead of f tan angle", "tangent": "f tan angle instead of f sin angle"}
-    if lens := [one.lens for one in found if one.lens is not None]:
-        parts.append(f"{words[camera.mapping]} {largest(lens)}")
+        parts.append(f"light of walls left out {largest(walls)}")
+    if lens := [one.lens_mapping for one in found if one.lens_mapping is not None]:
+        parts.append(f"lens mapping ({camera.mapping}, not {_OTHER[camera.mapping]}) {largest(lens)}")
     nanometres = mean_wavelength_m(camera.colours[len(camera.colours) // 2]) * 1e9
-    return f"PSFs may be off ({nanometres:.0f} nm, relative): " + ", ".join(parts)
+    return f"PSFs at {nanometres:.0f} nm may be off by (relative RMS): " + ", ".join(parts)

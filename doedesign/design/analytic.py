@@ -43,6 +43,16 @@ def cubic(y_m: Places, x_m: Places, waves: float, radius_m: float) -> Waves:
     return waves * ((y_m / radius_m) ** 3 + (x_m / radius_m) ** 3)
 
 
+def quartic(radius_m: Places, waves: float, rim_m: float) -> Waves:
+    """Spherical aberration with as much defocus against it, so many waves of each: zones focus on both sides.
+
+    It is a lens whose power changes evenly with the area, from one on the axis to its opposite at the rim: `waves` of
+    defocus on either side bring some zone into focus. S. Mezouari and A. R. Harvey, Opt. Lett. 28, 771 (2003).
+    """
+    square = (radius_m / rim_m) ** 2
+    return waves * (square**2 - square)
+
+
 def axilens(radius_m: Places, near_m: float, far_m: float, rim_m: float, wavelength_m: float) -> Waves:
     """Lens whose focal length grows with the square of the radius, from the first on the axis to the second at the rim.
 

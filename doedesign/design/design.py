@@ -1,5 +1,6 @@
 """Design: a DOE as it is drawn, with the camera it is for."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from doedesign.build import resolve_process, with_edge_moves
 from doedesign.spec import Spec, load_variation
-from fab.draws import EXPECTED, variation_at
+from fab.draws import EXPECTED, sources_of, variation_at
 from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from sim.rigorous.edge_optic import EdgeOptic
     from sim.surface import FabricatedDoe
 
+log = logging.getLogger("doedesign")
+
 
 @dataclass(frozen=True, eq=False)
 class Design:
@@ -37,7 +40,7 @@ class Design:
         near_m: distances of obstructions, metres.
         far_m: distances of the scene, metres; `inf` for a star.
         edge_moves_m: how far the masks draw the edges of etched areas outward to make up for the line-width bias of the
-            process, mask 0 first, metres; empty for nowhere.
+            process, first mask first, metres; empty for nowhere.
         aim: what the plate is to come out as, where the masks are drawn so that errors of the process lead there from
             another level map; None where that is the level map itself.
         continuous_m: ``[y, x]`` heights before rounding to levels, metres, if they are at hand.
@@ -130,6 +133,9 @@ class Design:
             return variation, "given errors"
         if variation is not None:
             return load_variation(variation), f"errors of {Path(variation).name}"
+        if not sources_of(process) and not any(spread.mean for spread in process.spreads.values()):
+            words = "the process has no errors, so this plate is the one drawn."
+            log.warning(f'{words} Give a process with errors, such as "contact_aligner".')
         key = EXPECTED if seed is None else draw
         errors = variation_at(process, seed or 0, max(self.camera.grid.extent_m), key)
         if seed is not None:

@@ -84,7 +84,7 @@ class DrawnPattern(NamedTuple):
     def summary(self) -> dict[str, Any]:
         """Its numbers, for metrics."""
         named = {} if self.colour is None else {"colour": self.colour, "depth_m": self.depth_m}
-        return {"efficiency": self.efficiency, "uniformity": self.uniformity, **named}
+        return {"on_target": self.efficiency, "uniformity": self.uniformity, **named}
 
 
 def drawn_patterns(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term, ...]) -> list[DrawnPattern]:

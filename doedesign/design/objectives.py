@@ -31,6 +31,7 @@ from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
 from fab.files import sha256_file
 from sim.camera import Camera
+from sim.imaging.filtering import filter_errors, photograph_spectrum, transfers
 from sim.metrics import disc_weights, mean_wavelength_m, participation, spot_radius_m
 
 Objective = Callable[..., Array]
@@ -190,6 +191,29 @@ def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
 def target_pattern(psfs: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
     """Squared distance of every far PSF from a target that holds all light, relative to the target's own square."""
     return psfs.highest(jnp.sum((psfs.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
+
+
+def filtered_error(psfs: PsfSet, *, noise: float = 0.01, contrast: float = 0.25, known: bool = False) -> Array:
+    """Mean squared error of the picture after the best linear filter, as a share of the scene's variance, 0-1.
+
+    One filter serves all far depths (`sim.imaging.filtering`), as a network does that is not told the depth: PSFs that
+    are alike count, not sharp ones. Light that leaves the window is lost.
+
+    Args:
+        psfs: PSFs of a step.
+        noise: standard deviation of a pixel's noise, white being 1.
+        contrast: standard deviation of the scene's light, white being 1.
+        known: whether every depth has a filter of its own.
+
+    Raises:
+        InputError: a number that is not positive.
+    """
+    for name, value in (("noise", noise), ("contrast", contrast)):
+        if not isinstance(value, int | float) or isinstance(value, bool) or not value > 0:
+            raise InputError(f"filtered_error: {name}", "must be above 0, white being 1", repr(value), "Try 0.01.")
+    side = psfs.far.shape[-1]
+    signal = photograph_spectrum(side, float(contrast) ** 2)
+    return psfs.highest(filter_errors(transfers(psfs.far), signal, float(noise) ** 2 / side**2, bool(known)))
 
 
 def _spots(psfs: PsfSet) -> Float[Array, "w f"]:

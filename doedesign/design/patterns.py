@@ -113,7 +113,7 @@ def _disc(camera: Camera, options: dict[str, Any], where: str) -> Image:
 
 
 # Every pattern with its options.
-_PATTERNS: dict[str, tuple[Callable[[Camera, dict[str, Any], str], np.ndarray], set[str]]] = {
+PATTERNS: dict[str, tuple[Callable[[Camera, dict[str, Any], str], np.ndarray], set[str]]] = {
     "spots": (_spots, {"count", "spacing", "offset"}),
     "square": (_square, {"width", "offset"}),
     "disc": (_disc, {"diameter", "offset"}),
@@ -149,11 +149,11 @@ def target_image(camera: Camera, options: dict[str, Any], picture: Path | None, 
         target = _picture(camera, picture)
     else:
         name = options.get("pattern")
-        if name not in _PATTERNS:
-            rule = f"must be one of {', '.join(_PATTERNS)}, or an `image` must be given"
+        if name not in PATTERNS:
+            rule = f"must be one of {', '.join(PATTERNS)}, or an `image` must be given"
             cure = 'For example options = { pattern = "square", width = "1 mm" }.'
             raise InputError(f"{where}: pattern", rule, repr(name), cure)
-        draw, known = _PATTERNS[name]
+        draw, known = PATTERNS[name]
         if unknown := sorted(options.keys() - known - {"pattern"}):
             rule = f'options of pattern "{name}" are: {", ".join(sorted(known))}'
             raise InputError(where, rule, unknown[0], "Remove or rename it.")

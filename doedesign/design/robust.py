@@ -172,7 +172,7 @@ class RobustTask(NamedTuple):
         cells = np.asarray(parametrization.cells(jnp.asarray(level)))
         camera = self.problem.camera
         cells = np.where(self.spec.doe.relief.inside(camera.grid), cells, parametrization.levels.count - 1)
-        made = as_fabricated(cells.astype(np.uint8), camera, self.process, variation)
+        made = as_fabricated(cells.astype(np.uint8), camera, self.process, variation, whole_cells=True)
         assert isinstance(optic, HeightOptic)
         return replace(self.problem, optic=optic.made_as(made, parametrization.drawn_height(cells)))
 

@@ -269,6 +269,12 @@ def cubic(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     return _wrapped(setup, analytic.cubic(*_places(setup, "cubic"), _number(options, "waves", 5, -1e3, 1e3), rim_m))
 
 
+def quartic(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Rings of fourth order of so many `waves`, which are in focus over as many waves of defocus on both sides."""
+    waves = _number(options, "waves", 5, -1e3, 1e3)
+    return _wrapped(setup, analytic.quartic(setup.radii_m(), waves, setup.camera.opening.reach_m))
+
+
 def axilens(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     """Lens of a focal length from `near` on the axis to `far` at the rim."""
     return _wrapped(setup, analytic.axilens(setup.radii_m(), *_foci(setup, options), setup.wavelength_m))

@@ -81,7 +81,7 @@ class FocusTable:
         ]
         return {
             "foci": rows,
-            "width_over_wanted": _finite(self.worst),
+            "focus_width": _finite(self.worst),
             "zeroth_order": self.zeroth_order,
             "ceiling": None,
             "ceiling_source": "none known",

@@ -20,8 +20,8 @@ class Foci(NamedTuple):
     """Foci on the axis behind a DOE, each of one colour.
 
     Attributes:
-        distance_m: behind the DOE.
-        width_m: full width at half maximum that is wanted at most.
+        distance_m: distance behind the DOE, metres.
+        width_m: full width at half maximum that is wanted at most, metres.
         weight: of its logarithm of light, all together 1.
         colour: number of the colour.
     """

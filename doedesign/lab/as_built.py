@@ -275,7 +275,8 @@ def _write(folder: Path, design: Design, process: Process, measured: AsBuilt, fo
         "gratings": compare_gratings(measured, process, doe.variation, design.camera.material),
     }
     write_bank(folder / "as-built.exr", bank, {"design": design.name, "plate": "as built"})
-    save(plot_psfs(bank, design.camera, design.near_m, design.far_m), folder / "as-built_psf.png")
+    picture = plot_psfs(bank, design.camera, design.near_m, design.far_m, title=f"{design.name}, as built")
+    save(picture, folder / "as-built_psf.png")
     (folder / "as-built.json").write_bytes(canonical_json(record))
     head = [f"plate of {design.name} as it was measured"]
     (folder / "variation.toml").write_text(variation_to_toml(doe.variation, head), encoding="utf-8")

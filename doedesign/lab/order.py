@@ -18,6 +18,7 @@ from doedesign.lab.predictions import PROBE_M, predict_sheet
 from doedesign.prediction import predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawing_from
+from doedesign.runs.orders import place_of_order, require_replaceable
 from doedesign.runs.verdict import certified_orders
 from doedesign.spec import OrderSpec, ProcessSpec, WaferSpec, load_order, load_process, load_wafer
 from fab.errors import InputError
@@ -49,13 +50,14 @@ def write_masks(
     terms: OrderTerms | str | Path | None = None,
     direct_write: bool = False,
     formats: Formats | None = None,
+    overwrite: bool = False,
     **geometry: Any,
 ) -> WrittenOrder:
     """Write and prove the mask order of a design or of any height map, with its run sheet.
 
     Args:
         source: a design, a finished run, its folder, or a height map (.exr, .npy, .tif, .png).
-        out: order folder; `masks/NAME` by default.
+        out: order folder; `masks/NAME` by default. An order in it is replaced if it is of the same run or level map.
         levels: number of heights; the run's own by default.
         on_violation: what to do where the process cannot print a mask: say so, refuse, or change the level map.
         probe_m: wavelength of the laser that the lab tests the DOE with, metres.
@@ -66,16 +68,21 @@ def write_masks(
             revision A and blanks, by default.
         direct_write: whether to write files for direct-write and greyscale exposure, too.
         formats: in which formats it is written; packed and coarse enough to mail by default.
+        overwrite: where the folder has the order of another design, replace that order.
         geometry: of a bare height map: `step_m`, `etch_depths_m`, `pitch_m`, `scale_m`, `aperture_m`
             (`doedesign.runs.level_maps.drawing_from`).
 
     Raises:
         InputError: the map cannot be drawn, the process cannot print it and `on_violation` is "fail", or the folder
-            cannot be written.
+            cannot be written or has the order of another design.
         CheckFailed: what was read back differs from what was asked for; nothing is left behind.
     """
     level_map, origin, design = drawing_from(source, levels, **geometry)
     spec = None if design is None else design.spec
+    run = None if design is None else design.folder
+    folder = place_of_order(level_map, origin, run) if out is None else Path(out)
+    if not overwrite:  # said before anything takes time
+        require_replaceable(folder, level_map, origin, run)
     made_by = _process(process, level_map.levels, spec and spec.process)
     if not isinstance(wafer, Wafer):
         usual = spec.wafer if spec else WaferSpec()
@@ -118,7 +125,7 @@ def write_masks(
             return None
         return seen._replace(predictions=replace(seen.predictions, certified=certified))
 
-    return write_planned(Path("masks") / level_map.name if out is None else out, order, predict=predicted)
+    return write_planned(folder, order, predict=predicted)
 
 
 def drawn_as(order: WrittenOrder) -> str:

@@ -190,6 +190,8 @@ def predict_sheet(
     )
 
     def picture() -> bytes:
-        return png_bytes(plot_psfs(expected.bank, design.camera, design.near_m, design.far_m))
+        return png_bytes(
+            plot_psfs(expected.bank, design.camera, design.near_m, design.far_m, title=f"{design.name}, expected")
+        )
 
     return SheetPrediction(predictions, picture)

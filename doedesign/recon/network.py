@@ -7,7 +7,9 @@ lacks the light that was kept off, and behind both it is blurred with the far PS
 
     light = F⁻¹[(capture - veil) exp(gain)].
 
-Veil and gain, which are smooth, are what the first stage ends in, with a correction of the picture for the rest.
+Veil and gain, which are smooth, are what the first stage ends in, with a correction of the picture for the rest. On
+request (`global_light`) a branch of low resolution, which sees the whole picture, undoes a veil and a gain before
+(`doedesign.recon.global_light`).
 Second stage: residual blocks that see the first stage's picture and the capture.
 
 PSFs are inputs: simulated, as fabricated or measured ones are handed in at run time, and the same weights serve all of
@@ -33,21 +35,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from doedesign.recon.conv import convolution, doubled
+from doedesign.recon.blocks import LEAK, QUIET, Block, normalised, shrunk
+from doedesign.recon.conv import doubled
+from doedesign.recon.global_light import GlobalLight, unveiled
 from doedesign.recon.wiener import Blur, blur_at, deblurred, sharpened
 from sim.light import srgb_from_linear
 
 Variant = Literal["paper", "release"]
 
-_LEAK = 0.01
 _WIDTHS = (1, 2, 4, 8, 12)  # features of every scale over those of the first
 _REFINEMENTS = 3
 _LOG_REGULARISER = float(np.log(1e-2))
 _LOG_BASE_REGULARISER = float(np.log(1e-3))  # of a whole picture: about the noise of a sensor in daylight
 _MOST_GAIN = 3.5  # of the logarithm: no sensor shows more than a factor of thirty
-# Of what leaves a stage: its last weights begin small, and as Adam moves every weight by as much whatever its slope,
-# what hundreds of them add up to has to be made small once more, or the first steps overshoot.
-_QUIET = 0.1
 # Of the release, and not learnt there.
 _RELEASE_LOG_REGULARISER = float(np.log(1e-6))
 
@@ -64,6 +64,7 @@ class NetworkShape:
     near_estimate: bool = True
     refine: bool = True
     variant: Variant = "paper"
+    global_light: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError for a width that colours do not divide, or a depth beyond 1 to 4."""
@@ -83,46 +84,6 @@ class NetworkShape:
         return int(2**self.depth)
 
 
-class Block(eqx.Module):
-    """Convolution, instance normalisation or a bias (which a normalisation would take away), leaky ReLU if `act`."""
-
-    weights: Float[Array, "ky kx i o"]
-    bias: Float[Array, " o"] | None
-    stride: int = eqx.field(static=True, default=1)
-    act: bool = eqx.field(static=True, default=True)
-
-    @classmethod
-    def make(
-        cls,
-        rng: np.random.Generator,
-        inputs: int,
-        outputs: int,
-        size: int = 3,
-        stride: int = 1,
-        *,
-        normal: bool = True,
-        act: bool = True,
-        gain: float = 1.0,
-    ) -> "Block":
-        """Draw weights of the variance that keeps signals as large as they are (He et al. 2015), times `gain`²."""
-        scale = gain * np.sqrt(2 / (1 + _LEAK**2) / (inputs * size * size))
-        weights = jnp.asarray((scale * rng.standard_normal((size, size, inputs, outputs))).astype(np.float32))
-        return cls(weights, None if normal else jnp.zeros(outputs), stride, act)
-
-    def __call__(self, image: Float[Array, "b y x i"], half: bool = False) -> Float[Array, "b v u o"]:
-        """Apply the block."""
-        found = convolution(image, self.weights, self.stride, half=half)
-        found = normalised(found) if self.bias is None else found + self.bias
-        return jax.nn.leaky_relu(found, _LEAK) if self.act else found
-
-
-def normalised(image: Float[Array, "b y x c"]) -> Float[Array, "b y x c"]:
-    """Every channel of every image with mean 0 and variance 1."""
-    mean = jnp.mean(image, axis=(1, 2), keepdims=True)
-    variance = jnp.mean((image - mean) ** 2, axis=(1, 2), keepdims=True)
-    return (image - mean) * jax.lax.rsqrt(variance + 1e-5)
-
-
 class Scale(eqx.Module):
     """Blocks of one scale on the way down, and the regulariser of its Wiener filter, or None without one."""
 
@@ -140,7 +101,7 @@ class UpBlock(eqx.Module):
         self, image: Float[Array, "b y x i"], beside: list[Float[Array, "b v u k"]], half: bool
     ) -> Float[Array, "b v u o"]:
         """Go up by one scale."""
-        risen = jax.nn.leaky_relu(normalised(doubled(image, self.weights)), _LEAK)
+        risen = jax.nn.leaky_relu(normalised(doubled(image, self.weights)), LEAK)
         return self.join(jnp.concatenate([risen, *beside], axis=-1), half)
 
 
@@ -156,6 +117,7 @@ class Network(eqx.Module):
         head: blocks that end in correction, veil and gain.
         residual: pairs of blocks of the second stage.
         last: its last block.
+        light: veil and gain from the whole picture, undone before those of the head; None without them.
         layout: its shape.
     """
 
@@ -167,6 +129,7 @@ class Network(eqx.Module):
     head: tuple[Block, ...]
     residual: tuple[tuple[Block, Block], ...]
     last: Block | None
+    light: GlobalLight | None
     layout: NetworkShape = eqx.field(static=True)
 
     @classmethod
@@ -180,7 +143,7 @@ class Network(eqx.Module):
         log_regulariser = _RELEASE_LOG_REGULARISER if release else _LOG_REGULARISER
 
         def scale(level: int) -> Scale:
-            inputs = c * (2 if layout.near_estimate else 1) if level == 0 else widths[level - 1]
+            inputs = c * (1 + layout.near_estimate + layout.global_light) if level == 0 else widths[level - 1]
             wide, normal = widths[level], level > 0 or release
             first = Block.make(rng, inputs, wide, 3 if level else 7, 2 if level else 1, normal=normal)
             more = [Block.make(rng, wide, wide, normal=normal) for _ in range(2 if level else 1)]
@@ -206,7 +169,7 @@ class Network(eqx.Module):
         middle = c if release else layout.width
         head = (
             Block.make(rng, layout.width, middle, normal=release),
-            Block.make(rng, middle, c if release else 3 * c, 5, normal=False, act=False, gain=_QUIET),
+            Block.make(rng, middle, c if release else 3 * c, 5, normal=False, act=False, gain=QUIET),
         )
         seen = c if release else 2 * c
         residual = tuple(
@@ -216,10 +179,11 @@ class Network(eqx.Module):
             )
             for _ in range(_REFINEMENTS if layout.refine else 0)
         )
-        last = Block.make(rng, seen, c, 5, normal=False, act=False, gain=_QUIET) if layout.refine else None
+        last = Block.make(rng, seen, c, 5, normal=False, act=False, gain=QUIET) if layout.refine else None
         near = jnp.full(c, log_regulariser, jnp.float32) if layout.near_estimate else None
         far = jnp.full(c, _LOG_BASE_REGULARISER, jnp.float32) if layout.wiener and not release else None
-        return cls(near, far, down, bottom, up, head, residual, last, layout)
+        light = GlobalLight.make(rng, c) if layout.global_light else None
+        return cls(near, far, down, bottom, up, head, residual, last, light, layout)
 
     def __call__(
         self,
@@ -256,6 +220,9 @@ class Network(eqx.Module):
         inputs = [light]
         if self.near_log_regulariser is not None:
             inputs.append(sharpened(light, near, self.near_log_regulariser))
+        clearer = light if self.light is None else unveiled(light, self.light(light, layout.multiple))
+        if self.light is not None:
+            inputs.append(clearer)
         features, skips = jnp.concatenate(inputs, axis=-1), []
         for level, scale in enumerate(self.down):
             shape = (capture.shape[2] >> level, capture.shape[3] >> level)
@@ -270,12 +237,12 @@ class Network(eqx.Module):
             image = keep(lambda r, i, b: r(i, b, half))(rise, image, skips.pop())
         for block in self.head:
             image = block(image, half)
-        image = _QUIET * image
+        image = QUIET * image
         if layout.variant == "release":
             picture = display + jnp.tanh(image)
         else:
             correction, veil, gain = jnp.split(image, 3, axis=-1)
-            light = (light - veil) * jnp.exp(_MOST_GAIN * jnp.tanh(gain))
+            light = (clearer - veil) * jnp.exp(_MOST_GAIN * jnp.tanh(gain))
             if self.far_log_regulariser is not None:
                 light = sharpened(light, far, self.far_log_regulariser)
             picture = srgb_from_linear(light) + jnp.tanh(correction)
@@ -288,9 +255,9 @@ class Network(eqx.Module):
         release = self.layout.variant == "release"
         seen = picture if release else jnp.concatenate([picture, display], axis=-1)
         for first, second in self.residual:
-            seen = jax.nn.leaky_relu(seen + second(first(seen, half), half), _LEAK)
+            seen = jax.nn.leaky_relu(seen + second(first(seen, half), half), LEAK)
         assert self.last is not None  # only then is there a second stage
-        found = picture + _QUIET * self.last(seen, half)
+        found = picture + QUIET * self.last(seen, half)
         return jax.nn.relu(found) if release else found
 
 
@@ -315,9 +282,3 @@ def _down(
     if blur is None or scale.log_regulariser is None:
         return image, [image]
     return image, [image, deblurred(image, blur, scale.log_regulariser)]
-
-
-def shrunk(image: Float[Array, "b y x c"], factor: int) -> Float[Array, "b v u c"]:
-    """Means over squares of `factor` pixels."""
-    b, y, x, c = image.shape
-    return image.reshape(b, y // factor, factor, x // factor, factor, c).mean(axis=(2, 4))

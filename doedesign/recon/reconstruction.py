@@ -47,7 +47,8 @@ class Reconstruction:
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the capture and the reconstruction side by side; return the figure."""
         y, x = self.light.shape[1:]
-        with panels(ax, (7.2, 3.6 * y / x + 0.6), layout="compressed") as figure:
+        words = f"obstruction at {length_text(self.near_m)}, scene at {length_text(self.far_m)}"
+        with panels(ax, (7.2, 3.6 * y / x + 1.3), self.name, words, layout="compressed") as figure:
             pictures = {"capture": srgb_from_linear(self.light), "reconstruction": self.picture}
             for axes, (title, picture) in zip(figure.subplots(1, 2), pictures.items(), strict=True):
                 shown = np.broadcast_to(np.clip(picture, 0, 1), (3, y, x))

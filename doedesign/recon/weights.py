@@ -19,7 +19,7 @@ Anything else that JSON can say may stand beside them: digests of spec and desig
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import equinox as eqx
 import jax
@@ -35,6 +35,9 @@ from sim.metrics import mean_wavelength_m
 FORMAT = "doedesign network 1"
 NETWORK_NAME, BANK_NAME = "network.npz", "psf.exr"  # as they lie beside each other in a model's folder
 
+_Tree = TypeVar("_Tree")
+
+_NEWER = ("global_light",)
 _CURE = "Copy it again from where it was made, or train again."
 
 
@@ -55,6 +58,16 @@ def write_network(path: str | Path, network: Network, about: Mapping[str, Any], 
         InputError: a weight is not finite (or too large for float16), or the system refuses the path.
         ValueError: `about` holds what JSON cannot say.
     """
+    header = {"format": FORMAT, "layout": _said(network.layout), "about": dict(about)}
+    write_archive(path, header, stored_arrays(path, network, half=half))
+
+
+def stored_arrays(path: str | Path, network: Any, *, half: bool = False) -> dict[str, np.ndarray]:
+    """Arrays of a network by where they stand in it, as a file holds them, in float16 if `half`.
+
+    Raises:
+        InputError: a weight is not finite (or too large for float16); the message names the file's path.
+    """
     arrays = {name: np.asarray(leaf) for name, leaf in _named(network).items()}
     with np.errstate(over="ignore"):  # what float16 cannot hold becomes infinite and is refused below
         stored = {name: array.astype(np.float16) if half else array for name, array in arrays.items()}
@@ -62,8 +75,7 @@ def write_network(path: str | Path, network: Network, about: Mapping[str, Any], 
         if not np.isfinite(array).all():
             cure = "Go back to a checkpoint before training broke."
             raise InputError(str(path), "weights must be finite", f"others in {name}", cure)
-    header = {"format": FORMAT, "layout": asdict(network.layout), "about": dict(about)}
-    write_archive(path, header, stored)
+    return stored
 
 
 def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
@@ -86,7 +98,13 @@ def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
     about = header.get("about")
     if not isinstance(about, dict):
         raise InputError(str(path), "must say what it is about", repr(about), _CURE)
-    return _filled(path, layout, arrays), about
+    # Its weights are not drawn.
+    return with_arrays(path, eqx.filter_eval_shape(Network.make, layout, 0), arrays), about
+
+
+def _said(layout: NetworkShape) -> dict[str, Any]:
+    """The layout for the file; a part that older files do not know is left out where the network has none."""
+    return {name: value for name, value in asdict(layout).items() if name not in _NEWER or value}
 
 
 def _layout(said: Any, weights: int) -> NetworkShape:
@@ -113,9 +131,12 @@ def _named(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(where): leaf for where, leaf in leaves}
 
 
-def _filled(path: Path, layout: NetworkShape, arrays: Mapping[str, np.ndarray]) -> Network:
-    """A network of a layout with the weights of a file."""
-    empty = eqx.filter_eval_shape(Network.make, layout, 0)  # its weights are not drawn
+def with_arrays(path: Path, empty: _Tree, arrays: Mapping[str, np.ndarray]) -> _Tree:
+    """A network with the weights of a file, in single precision, from one that has shapes in their places.
+
+    Raises:
+        InputError: an array is missing, of another shape or kind, not finite, or one too many.
+    """
     slots = _named(empty)
     for name, slot in slots.items():
         if name not in arrays:

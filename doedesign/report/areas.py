@@ -26,7 +26,7 @@ _NOTE += "of the light is wanted."
 def plot_areas(tables: "Sequence[AreaTable]", ax: "Axes | None" = None) -> "FigureBase":
     """Draw several areas below each other, as `plot_area` does each, over the colour and the place of each."""
     note = _NOTE.format(100 * (1 - tables[0].fresnel))
-    with panels(ax, (8.6, 4.1 * len(tables)), note=note) as figure:
+    with panels(ax, (8.6, 4.1 * len(tables) + 0.35), "Light of every area", note) as figure:
         parts = figure.subfigures(len(tables), 1, squeeze=False)
         for table, part in zip(tables, parts[:, 0], strict=True):
             part.suptitle(f"{table.place}: {_title(table)}", x=0.01, ha="left", parse_math=False)

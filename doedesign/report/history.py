@@ -5,20 +5,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from doedesign.spec import Spec
 from fab.figure import INK, SERIES, panels, single
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["plot_history", "plot_training"]
+__all__ = ["plot_history", "plot_spot_history", "plot_training"]
 
 
-def plot_history(records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None) -> "Axes":
+def plot_history(
+    records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None, *, title: str = "", note: str = ""
+) -> "Axes":
     """Draw the loss of an optimisation and its terms over the steps, on `ax` or the axes of a new figure.
 
     A long history is drawn faintly under its running mean, since every step sees another depth. A record per step has
-    "step", "loss", "terms" (values, not weighted) and "names" (of the terms).
+    "step", "loss", "terms" (values, not weighted) and "names" (of the terms). The `title` says whose it is, the `note`
+    why it is not smooth (`history_note`).
 
     Raises:
         ValueError: no records.
@@ -33,7 +37,8 @@ def plot_history(records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None)
         for i, (label, column) in enumerate(zip(labels, values.T, strict=True))
         if i == 0 or not np.allclose(column, values[:, 0])
     }
-    with single(ax, (6.6, 3.4)) as axes:
+    heading = f"{title}: loss over the steps" if title else "Loss over the steps"
+    with single(ax, (6.6, 3.9 if note else 3.6), heading, note) as axes:
         window = _plot_series(axes, steps, series, faint=True)
         if values.min() > 0 and values.max() > 30 * values.min():
             axes.set_yscale("log")
@@ -44,6 +49,60 @@ def plot_history(records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None)
         axes.grid(True)
         axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
     return axes
+
+
+def plot_spot_history(
+    records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None, *, title: str = "", note: str = ""
+) -> "FigureBase":
+    """Draw the light of spots over the steps, and beside it how unequal they are, in per cent.
+
+    Each has an axis of its own: one changes by a percent, the other by decades. A record per step has the "terms"
+    efficiency and uniformity error, among its "names"; the others are as in `plot_history`.
+
+    Raises:
+        ValueError: no records.
+    """
+    steps = _steps(records)
+    terms = {name: k for k, name in enumerate(records[0]["names"])}
+    values = 100 * np.array([record["terms"] for record in records], np.float64)
+    heading = "light on the spots and uniformity error over the steps"
+    heading = f"{title}: {heading}" if title else heading.capitalize()
+    with panels(ax, (8.4, 3.9 if note else 3.6), heading, note) as figure:
+        left, right = figure.subplots(1, 2)
+        for axes, name, label in ((left, "efficiency", "light on the spots (%)"),
+                                  (right, "uniformity_error", "uniformity error (%)")):  # fmt: skip
+            series = values[:, terms[name]]
+            window = _plot_series(axes, steps, {name: series}, faint=True)
+            axes.set(xlabel=f"step (running mean of {window})" if window > 1 else "step", ylabel=label)
+            axes.grid(True)
+        if series.min() > 0 and series.max() > 3 * series.min():
+            right.set_yscale("log")
+        else:
+            right.set_ylim(bottom=0)
+    return figure
+
+
+def history_note(spec: Spec) -> str:
+    """Why the loss of a spec is not smooth, in words for its picture; nothing where it should be.
+
+    Args:
+        spec: the spec.
+    """
+    if spec.aims:
+        if spec.spots is not None:
+            return "Weights of the spots follow the light of the rounded levels, step by step, so the light may jump."
+        return "First phases are free, then they take the levels of the process, which costs something at first."
+    words = []
+    if spec.optimize.colours == "in_turn" and len(spec.optics.colours) > 1:
+        count = len(spec.optics.colours)
+        words.append(
+            f"Every step looks at one of {count} colours in turn, which are not equally good: hence the zigzag."
+        )
+    elif len(spec.scene.near_m) > 1 or len(spec.scene.far_m) > 1:
+        words.append("Every step looks at one near and one far depth, in shuffled rounds: hence the zigzag.")
+    if spec.robust is not None:
+        words.append(f"From step {spec.optimize.steps} on, plates with errors are judged, whose loss is higher.")
+    return " ".join(words)
 
 
 def plot_training(records: Sequence[Mapping[str, Any]], title: str = "", ax: "Axes | None" = None) -> "FigureBase":
@@ -61,7 +120,12 @@ def plot_training(records: Sequence[Mapping[str, Any]], title: str = "", ax: "Ax
         values = np.array([record["parts"].get(name, np.nan) for record in records], np.float64)
         if np.any(values != 0):  # a term without weight is not computed
             series[name] = values
-    with panels(ax, (8.4, 4.0), title) as figure:
+    heading = f"{title}: training of the network" if title else "Training of the network"
+    note = (
+        "Every step sees other scenes, so its loss jumps. Right: pictures that are never trained on, before (capture)"
+    )
+    note += " and after the network (reconstruction); occluded: where they are covered."
+    with panels(ax, (8.4, 4.6), heading, note) as figure:
         left, right = figure.subplots(1, 2)
         window = _plot_series(left, steps, series)
         left.set_ylim(bottom=0)

@@ -8,10 +8,10 @@ __all__ = ["error_label", "number_text", "value_text"]
 
 
 def error_label(name: str) -> str:
-    """An error in words: "overlay x, mask 2" for "overlay_x_m[2]"."""
+    """An error in words: "overlay x, mask 3" for "overlay_x_m[2]"; people count masks from 1, as the run sheet does."""
     key, _, mask = name.partition("[")
     words = key.removesuffix("_m").removesuffix("_rad").replace("_", " ")
-    return f"{words}, mask {mask.removesuffix(']')}" if mask else words
+    return f"{words}, mask {int(mask.removesuffix(']')) + 1}" if mask else words
 
 
 def value_text(name: str, value: float, sigma: float | None = None) -> str:

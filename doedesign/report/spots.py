@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
 from fab.figure import FAINT, INK, LINE, MARK, panels
 from sim.plots.places import label_places
 
@@ -29,6 +30,7 @@ def plot_orders(table: "OrderTable", ax: "Axes | None" = None) -> "FigureBase":
     ceiling = "No ceiling is known."
     if bound.efficiency is not None:
         ceiling = f"Ceiling {100 * bound.efficiency:.1f} %: {bound.source}."
+    zeroth = f"0th order ({ONE_OF_THE_SPOTS})" if table.zeroth_order_wanted else "0th order"
     lost = f"{100 * (1 - table.fresnel):.1f} % that faces reflect"
     note = f"Shares of the light on the aperture; {lost} are left out. {ceiling}"
     with panels(ax, (8.6, 4.4), title, note) as figure:
@@ -37,7 +39,7 @@ def plot_orders(table: "OrderTable", ax: "Axes | None" = None) -> "FigureBase":
         left.bar(at, 100 * table.efficiency, 0.8, color=LINE, label="reached")
         left.step(np.append(at - 0.5, at[-1] + 0.5), 100 * np.append(wanted, wanted[-1]), where="post", color=MARK,
                   lw=1, label="wanted share of the total")  # fmt: skip
-        left.axhline(100 * table.zeroth_order, color=INK, lw=0.8, ls=":", label="0th order")
+        left.axhline(100 * table.zeroth_order, color=INK, lw=0.8, ls=":", label=zeroth)
         if table.strongest_stray is not None:
             left.axhline(100 * table.strongest_stray, color=FAINT, lw=0.8, ls="--", label="strongest stray order")
         left.set(xlim=(-0.7, spots.count - 0.3), ylim=(0, 128 * table.efficiency.max()), ylabel="efficiency (%)")

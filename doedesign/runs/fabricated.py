@@ -139,7 +139,9 @@ def _write(folder: Path, design: Design, found: FabricatedPsfs, words: str) -> N
         (folder / f"{made.name}.csv").write_text(made.to_csv(), encoding="utf-8")
         save(made.plot(), folder / f"{made.name}.png")
     (folder / "metrics.json").write_bytes(canonical_json(metrics))
-    save(plot_psfs(found.bank, design.camera, design.near_m, design.far_m), folder / "fabricated_psf.png")
+    whose = f"{design.name}, as fabricated"
+    picture = plot_psfs(found.bank, design.camera, design.near_m, design.far_m, title=whose)
+    save(picture, folder / "fabricated_psf.png")
     orders = [
         tuple(
             next(r["zeroth_order"] for r in found.rows[name] if r["colour"] == colour)

@@ -3,7 +3,7 @@
     runs/NAME/
         manifest.json           spec digest, inputs, version, digests of all results when done, and the depths of the
                                 etches if the run was to choose them, or that its plate should come out with
-        spec.toml               the spec with every default and override filled in
+        spec.toml               the spec with overrides and defaults; optional keys where they differ
         checkpoint.npz          parameters, Adam's moments and history; only while the run is unfinished
         level_map.npz           the design: level of every cell, staircase, grid and aperture (`fab.level_map`)
         height.exr              the heights that follow from it, metres (the heights before rounding where the run is
@@ -12,6 +12,7 @@
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.design.metrics`
         *.png                   pictures
+    cost.jsonl              time and memory of the commands that worked on the run; no result (`doedesign.runs.costs`)
         psf/, fabricated/, certificate/, simulated/, trained/, tolerance/, calibrate/     results of later commands
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
@@ -56,11 +57,13 @@ from fab.files import (
     sha256_file,
     write_atomic,
 )
+from fab.manifest.records import FORMAT as ORDER
 
 FORMAT = "doedesign run 1"
 TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a DOE of its own
 RELEASED = "doedesign released model 1"  # a training that is given away, with its DOE
 CHECKPOINT = "checkpoint.npz"
+COST_NAME = "cost.jsonl"  # no result: `doedesign.runs.costs`
 LEVEL_MAP, HEIGHT, CONTINUOUS = "level_map.npz", "height.exr", "height_continuous.exr"
 _DEPTHS, AIM_DEPTHS = "etch_depths_m", "aim_depths_m"
 # Tables of a spec that may be changed for a finished DOE, where it is looked through and where a network is trained.
@@ -71,7 +74,7 @@ _FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "d
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
 _UNFINISHED = re.compile(
-    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|csv|png)|(psf|fabricated|certificate|calibration|explanations|as-built)\.new)\.[a-z0-9_]{8}"
+    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|csv|png|html)|(psf|fabricated|certificate|calibration|explanations|as-built)\.new)\.[a-z0-9_]{8}"
 )
 
 
@@ -216,7 +219,7 @@ def _belongs(found: "_Manifest", spec: Spec, inputs: Mapping[str, str]) -> bool:
 def _is_done(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> bool:
     """Whether a run is finished; refuse it if it is not that of a spec and its inputs."""
     found = _read_manifest(folder)
-    if found.state != "done" and {path.name for path in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml"}:
+    if found.state != "done" and {path.name for path in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml", COST_NAME}:
         return False  # begun and nothing more: there is nothing to lose, whatever the spec was
     if not _belongs(found, spec, inputs):
         own = folder / "spec.toml"
@@ -303,6 +306,7 @@ def open_run(folder: Path) -> Run:
         raise InputError(str(folder), "must be a run folder", got, "Make one with: doedesign optimize SPEC")
     if not (folder / MANIFEST_NAME).is_file():
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
+    _require_no_order(folder)
     manifest = _read_manifest(folder, (FORMAT, TRAINING, RELEASED))
     path = folder / "spec.toml"
     spec = load_spec(path)
@@ -324,6 +328,17 @@ def open_run(folder: Path) -> Run:
         process = spec_to_json(spec)["process"] | {_DEPTHS: manifest.etch_depths_m}
         spec = spec_from_json(spec_to_json(spec) | {"process": process}, str(folder / MANIFEST_NAME))
     return Run(folder, spec, done=True, aim_depths_m=manifest.aim_depths_m)
+
+
+def _require_no_order(folder: Path) -> None:
+    """Refuse a mask order where a run is wanted, and propose its run."""
+    found = read_json(folder / MANIFEST_NAME)
+    if found.get("format") != ORDER:
+        return
+    source = found.get("source")
+    of_run = isinstance(source, dict) and source.get("kind") == "run"
+    cure = f"Give its run, such as {Path('runs') / str(found.get('name'))}." if of_run else "Give the folder of a run."
+    raise InputError(str(folder), "must be a run folder", "a mask order", cure)
 
 
 def named(spec: Spec, name: str) -> Spec:

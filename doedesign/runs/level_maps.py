@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from math import isclose
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -12,6 +11,7 @@ import numpy as np
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
 from doedesign.runs.folder import CAPTURE_TABLES, CONTINUOUS, HEIGHT, LEVEL_MAP, Run, open_run, spec_with
+from doedesign.runs.orders import order_of_run, require_order_of
 from doedesign.spec import HEIGHT_FILES
 from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
@@ -113,7 +113,7 @@ def open_design(
         return source
     run = source if isinstance(source, Run) else open_run(Path(source))
     level_map = level_map_of_run(run, levels)
-    folder = Path(masks or f"masks/{run.spec.name}")
+    folder = Path(masks) if masks else order_of_run(run.spec.name, run.folder, level_map)
     moves_m = run.spec.wafer.edge_moves_m if levels is None else ()
     if levels is None and masks is not False and (masks or (folder / MANIFEST_NAME).is_file()):
         level_map = level_map.with_level(drawn_in_masks(folder, level_map))
@@ -164,7 +164,7 @@ def drawing_from(
         source: the design, the run or its folder, or the height map.
         count: number of levels.
         step_m: height of one level, metres; for a bare height map, like the rest.
-        etch_depths_m: depth of every mask where it is not 2^k steps, mask 0 first, metres.
+        etch_depths_m: depth of every mask where it is not 2^k steps, first mask first, metres.
         pitch_m: pixel pitch, metres.
         scale_m: metres per count, for integers.
         aperture_m: diameter of the relief, or its width and height, metres; or the name of a picture of it
@@ -177,6 +177,10 @@ def drawing_from(
         source = Path(source)
     if isinstance(source, Path) and not source.exists():
         raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
+    if isinstance(source, Path) and source.suffix.lower() == ".toml":
+        rule = f"must be a run folder or a height map ({', '.join(HEIGHT_FILES)})"
+        cure = f"Optimise it first, and give its run: doedesign optimize {source}."
+        raise InputError(str(source), rule, "a spec", cure)
     if not isinstance(source, Path) or source.is_dir():
         geometry = {"step_m": step_m, "etch_depths_m": etch_depths_m or None, "pitch_m": pitch_m, "scale_m": scale_m}
         for name, value in {**geometry, "aperture_m": aperture_m}.items():
@@ -250,18 +254,7 @@ def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
     from fab.verification.files import read_drawn_levels  # slow to import
 
     manifest = read_manifest(folder)
+    require_order_of(folder, manifest, level_map)
     levels, grid = manifest.staircase(), manifest.grid()
-    alike = grid.shape == level_map.shape and levels.count == level_map.levels.count
-    # The manifest rounds lengths to its units' last digit.
-    lengths = [(grid.pitch_m, level_map.grid.pitch_m), (levels.step_m, level_map.levels.step_m)]
-    lengths += zip(levels.depths_m, level_map.levels.depths_m, strict=False)
-    if not (alike and all(isclose(found, wanted, rel_tol=1e-6) for found, wanted in lengths)):
-        ny, nx = grid.shape
-        got = f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels}"
-        rule = f"the masks must be those of this run, {level_map}"
-        raise InputError(str(folder), rule, got, "Give the masks of this run.")
-    if manifest.source.get("level_map_sha256", level_map.digest) != level_map.digest:
-        rule, got = "the masks must be those of this run", "those of another, such as an earlier one"
-        raise InputError(str(folder), rule, got, "Draw the masks of this run again: doedesign masks RUN.")
     files, moves = manifest.drawn_files(folder), manifest.edge_moves()
     return read_drawn_levels(files, levels, pixel_edges(grid), manifest.doe_cell, moves)

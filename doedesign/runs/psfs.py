@@ -12,8 +12,10 @@ import numpy as np
 
 from doedesign.build import camera_from_spec
 from doedesign.design.metrics import design_metrics
+from doedesign.runs.curve_tables import encircled_csv, mtf_csv
 from doedesign.runs.folder import CONTINUOUS, Run, open_run
 from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
+from doedesign.runs.orders import order_of_run
 from doedesign.runs.results import results_folder
 from doedesign.runs.verdict import certified_orders, verdict_in_words, with_verdict
 from doedesign.runtime.progress import meter
@@ -25,7 +27,7 @@ from fab.height import HeightMap
 from fab.plots.height import plot_height
 from fab.runsheet.tables import CertifiedOrder
 from sim.optic import HeightOptic, RingOptic
-from sim.plots.curves import plot_encircled, plot_mtf
+from sim.plots.curves import encircled_curves, plot_encircled, plot_mtf
 from sim.plots.psfs import plot_psfs
 from sim.propagation.hankel import radial_profile, ring_count
 from sim.psf_bank import PsfBank, psf
@@ -65,10 +67,10 @@ def psfs(
     near, far = _near_and_far(run.spec, depths_m)
     designs = _heights_of(run, masks)
     certified = certified_orders(run.folder, level_map_of_run(run).digest)
-    total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
-    optics: dict[str, Any] = {
-        name: optic_as_drawn(camera, height, depths_m=(*near, *far)) for name, height in designs.items()
-    }
+    # What masks draw was just found equal to the level map in every cell, so its light is the same.
+    different = [name for name in designs if name != "from_masks"]
+    total = len(different) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
+    optics: dict[str, Any] = {name: optic_as_drawn(camera, designs[name], depths_m=(*near, *far)) for name in different}
     with results_folder(out, run.spec.name, run.folder, light=camera.light) as fresh:
         with meter("PSFs", total) as progress:
             done = count(1)
@@ -81,9 +83,9 @@ def psfs(
                 given: Any = {"field_rad": field_rad, "propagation": propagation}
                 return psf(optic, depths=(*near, *far), on_psf=lambda: progress.advance(next(done)), **given)
 
-            banks = {name: bank(name) for name in designs}
-        if "from_masks" in banks and not np.array_equal(banks["from_masks"].energy, banks["quantised"].energy):
-            raise CheckFailed([f"{run.folder}: the PSFs of the masks are not those of the quantised design"])
+            banks = {name: bank(name) for name in different}
+        if "from_masks" in designs:
+            banks["from_masks"] = banks["quantised"]
         if fresh is not None:
             log.info("writing banks and pictures")
             _write(fresh, run, optics, banks, near, far, certified)
@@ -98,7 +100,7 @@ def _heights_of(run: Run, masks: str | Path | None) -> dict[str, np.ndarray]:
     # A training that left the DOE as it was has only the heights after rounding.
     before = {"continuous": read_any_height(file).height_m} if file.is_file() else {}
     designs = {**before, "quantised": level_map.height_m}
-    folder = Path("masks") / run.spec.name if masks is None else Path(masks)
+    folder = order_of_run(run.spec.name, run.folder, level_map) if masks is None else Path(masks)
     if masks is None and not (folder / MANIFEST_NAME).is_file():
         log.info(f"no mask order in {folder}; write one with: doedesign masks {run.folder}")
         return designs
@@ -142,14 +144,17 @@ def _write(
     lens_transfer = mtf(flat, depths=depths)
     metrics: dict[str, Any] = {"lens": camera.lens_text, "light": camera.light}
     for name, optic in optics.items():
-        if name == "from_masks":
-            continue
         bank = banks[name]
         write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name, "lens": camera.lens_text})
-        save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
+        whose = f"{run.spec.name}, {name.replace('_', ' ')}"
+        save(plot_psfs(bank, camera, near, far, title=whose), folder / f"{name}_psf.png")
         transfer = mtf(optic, depths=depths)
-        save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")
-        save(plot_encircled(bank, camera, near, far, lens), folder / f"{name}_encircled.png")
+        save(plot_mtf(transfer, camera, near, far, lens_transfer, title=whose), folder / f"{name}_mtf.png")
+        within = encircled_curves([bank, lens])
+        picture = plot_encircled(bank, camera, near, far, lens, title=whose, curves=within)
+        save(picture, folder / f"{name}_encircled.png")
+        (folder / f"{name}_mtf.csv").write_bytes(mtf_csv(transfer, lens_transfer).encode())
+        (folder / f"{name}_encircled.csv").write_bytes(encircled_csv(bank, within, camera).encode())
         metrics[name] = design_metrics(optic, bank, near, lens)
     # Of the map itself; the heights before rounding have other walls.
     metrics["quantised"] = with_verdict(metrics["quantised"], certified)
@@ -157,7 +162,7 @@ def _write(
         # The budget's band is that of a raster of cells, which rings are not.
         metrics["continuous"] = [{k: v for k, v in row.items() if k != "budget"} for row in metrics["continuous"]]
     if "from_masks" in banks:
-        # Equal to the last bit (checked above), so its numbers and pictures are the same files.
+        # Its numbers and pictures are the same files.
         metrics["from_masks"] = metrics["quantised"]
         for path in sorted(folder.glob("quantised*")):
             shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))

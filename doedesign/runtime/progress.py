@@ -33,7 +33,7 @@ class Meter:
         parts = [f"{self._title}: {done}/{self._total}"]
         if done > self._start and now > self._begun:
             rate = (done - self._start) / (now - self._begun)
-            parts += [f"{rate:.2f}/s", f"{_duration_text((self._total - done) / rate)} left"]
+            parts += [f"{rate:.2f}/s", f"{duration_text((self._total - done) / rate)} left"]
         print(", ".join([*parts, note] if note else parts), file=sys.stderr, flush=True)
 
 
@@ -45,8 +45,12 @@ class _BarMeter(Meter):
         self._bar.update(self._task, completed=done, note=note)
 
 
-def _duration_text(seconds: float) -> str:
-    """Duration as people write it: 40 s, 12 min, 2 h 5 min."""
+def duration_text(seconds: float) -> str:
+    """Duration as people write it: 40 s, 12 min, 2 h 5 min.
+
+    Args:
+        seconds: the duration.
+    """
     if seconds < 100:
         return f"{seconds:.0f} s"
     hours, minutes = divmod(round(seconds / 60), 60)

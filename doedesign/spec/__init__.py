@@ -90,8 +90,8 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
             table with the table before it (``process__levels=8, sensor__pitch="1.85 um"``), or a whole table.
 
     Returns:
-        The spec with every default filled in, and what its task says (`doedesign.spec.left_out`). Files it names are
-        not opened (see `input_files`), but for a spectral response, whose colours become part of the spec, and the
+        The spec with its defaults, and what its task says (`doedesign.spec.left_out`). Files it names are not
+        opened (see `input_files`), but for a spectral response, whose colours become part of the spec, and the
         picture of an aperture, whose open cells do.
 
     Raises:
@@ -222,6 +222,9 @@ def kept_pictures(spec: Spec) -> dict[str, str]:
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
     """Read the tables of a TOML file; `what` it should hold ("a spec") and an `example` of that are for messages."""
     cure = f"Give {what} such as {example}."
+    beside = path.with_name(f"{path.name}.toml")
+    if path.name and not path.exists() and beside.is_file():
+        raise InputError(str(path), "the file must exist", "nothing of that name", f"Did you mean {beside}?")
     content = read_bytes(path, 1 << 24)
     try:
         return tomllib.loads(content.decode())

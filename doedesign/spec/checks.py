@@ -343,7 +343,7 @@ def _cases(spec: Spec, index: int) -> Iterator[InputError]:
     if not objective.depths_m:
         return
     looks = {
-        **dict.fromkeys(("far_spot", "spot_energy", "equal_colours", "target_pattern"), ("far",)),
+        **dict.fromkeys(("far_spot", "spot_energy", "equal_colours", "target_pattern", "filtered_error"), ("far",)),
         "near_spread": ("near",),
         "handcrafted": ("near", "far"),
     }

@@ -39,7 +39,7 @@ def _level_warning(spec: Spec) -> Iterator[str]:
     wave_m = full_wave_height_m(material, spec.optics.design_wavelength_m)
     waves = height_m / wave_m
     whole = max(1, round(waves))  # a relief of several waves parts colours
-    if abs(waves / whole - 1) <= _WAVE_TOLERANCE:
+    if abs(waves / whole - 1) <= _WAVE_TOLERANCE or (waves < 1 and _nearly_flat(spec)):
         return
     try:
         exact = f"of {material} is one wave at {full_wave_wavelength_m(material, height_m) / NM:.0f} nm"
@@ -51,6 +51,12 @@ def _level_warning(spec: Spec) -> Iterator[str]:
         f"{waves:.4f} waves, {100 * (waves / whole - 1):+.1f} % off, so the top of the staircase does not meet its "
         f'foot. A level_step of "{whole * wave_m / process.levels / NM:.2f} nm" would.'
     )
+
+
+def _nearly_flat(spec: Spec) -> bool:
+    """Whether one spot should keep most of the light, for which a relief of less than a wave is right."""
+    weights = spec.spots.weights if spec.spots is not None else ()
+    return bool(weights) and max(weights) > sum(weights) / 2
 
 
 def _image_share(spec: Spec, sine: float) -> float:

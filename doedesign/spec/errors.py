@@ -6,6 +6,7 @@ Pydantic finds the mistakes, this file words them. A mistake is an `InputError` 
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
@@ -23,6 +24,12 @@ Table = TypeVar("Table", bound=SpecTable)
 _SHORT_FORM = 'For example `wavelengths = ["656 nm", "589 nm", "486 nm"]`.'
 _COLOURS_KEY = re.compile(r"optics\.colours(\[\d+\])?.*")
 _SIGMA_KEY = re.compile(r"(process\.errors\.(\w+))\.sigma\b(.*)")
+# How like a key an unknown one is that was meant to be it; more than to be proposed, for it hides another mistake.
+_SLIP = 0.75
+_UNKNOWN = "extra_forbidden"  # as pydantic calls a key that is not known
+# What says the task of a spec, and the tables that may be left out then (`doedesign.spec.left_out`).
+_TASKS = ("spots", "area", "focus", "illumination", "optimize", "optimize.start")
+_SAID = ("scene", "sensor")
 _RULES = {
     "int_type": "must be a whole number",
     "int_from_float": "must be a whole number",
@@ -74,8 +81,25 @@ def validated(
         found = error.errors(include_url=False)
     # Pydantic also calls a list with wrong entries too short, which would only repeat them.
     inner = {details["loc"][:length] for details in found for length in range(len(details["loc"]))}
-    mistakes = [_mistake(d, raw, model) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
+    told = [d for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
+    told.sort(key=lambda d: d["type"] != _UNKNOWN)  # what it misses may follow from a slip in a name
+    mistakes = [_mistake(d, raw, model) for d in told]
+    meant = {_meant(d["loc"], m.where, model) for d, m in zip(told, mistakes, strict=True) if d["type"] == _UNKNOWN}
+    missing = [d["type"] == "missing" for d in told]
+    mistakes = [m for m, lost in zip(mistakes, missing, strict=True) if not (lost and _follows(m.where, meant))]
     raise spec_error(source, mistakes, overridden)
+
+
+def _meant(location: Location, key: str, root: type[SpecTable]) -> str:
+    """Dotted key that an unknown one was probably meant to be; empty where none is like it."""
+    parent = _table_at(location[:-1], root)
+    close = get_close_matches(str(location[-1]), _keys(parent) if parent else [], n=1, cutoff=_SLIP)
+    return f"{key.rpartition('.')[0]}.{close[0]}".removeprefix(".") if close else ""
+
+
+def _follows(missing: str, meant: Collection[str]) -> bool:
+    """Whether a key is missing only because of a slip in the name of one that was meant."""
+    return missing in meant or (missing.partition(".")[0] in _SAID and bool({*meant} & {*_TASKS}))
 
 
 def spec_error(source: str, mistakes: Sequence[InputError], overridden: Collection[str] = ()) -> InputError:
@@ -95,7 +119,7 @@ def _covers(overridden: Collection[str], key: str) -> bool:
 def _mistake(details: ErrorDetails, raw: Mapping[str, Any], root: type[SpecTable]) -> InputError:
     location, kind, context = details["loc"], details["type"], details.get("ctx", {})
     key = key_as_written("".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in location).removeprefix("."), raw)
-    if kind == "extra_forbidden":
+    if kind == _UNKNOWN:
         return _unknown(key, location, root)
     got, example = _value_text(details["input"]), _example(location, root)
     if key == "optics.wavelengths":

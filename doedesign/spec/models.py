@@ -29,6 +29,7 @@ from doedesign.spec.targets.focus import FocusSpec
 from doedesign.spec.targets.spots import SpotsSpec
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
+    DEPTHS_OBJECTIVES,
     HEIGHT_FILES,
     OBJECTIVES,
     STARTS,
@@ -95,7 +96,7 @@ class ColourSpec(SpecTable, frozen=True):
 
     name: ColourName = Field(examples=['"red"'])
     wavelengths_m: tuple[Wavelength, ...] = Field(min_length=1, examples=['["656 nm"]'])
-    weights: tuple[Positive, ...] = Field(default=(), validate_default=True)
+    weights: tuple[Positive, ...] = Field(default=(), validate_default=True, examples=["[1.0]"])
 
     @field_validator("weights")
     @classmethod
@@ -134,7 +135,7 @@ class OpticsSpec(SpecTable, frozen=True):
         polarisation: of the light at walls: "unpolarised", or "x" or "y", the axis of the electric field.
     """
 
-    focal_length_m: Annotated[float, length(10 * UM, 100.0)] | None = optional()
+    focal_length_m: Annotated[float, length(10 * UM, 100.0)] | None = optional(example='"8 mm"')
     design_wavelength_m: Wavelength = Field(examples=['"550 nm"'])
     colours: tuple[ColourSpec, ...] = Field(min_length=1)
     propagation: Literal["far_field", "fresnel"] = "far_field"
@@ -213,8 +214,8 @@ class OptimizeSpec(SpecTable, frozen=True):
     Attributes:
         parametrization: "freeform" (every cell) or "radial" (a profile over the radius).
         start: a built-in one, which with `steps = 0` is a design of its own: "flat", "random", "fresnel", "ring",
-            "nlopt", "axicon", "vortex", "blazed", "lens_array", "cubic", "axilens", "logarithmic_asphere"
-            (`doedesign.design.starts`); or the path of a height map relative to the spec file.
+            "nlopt", "axicon", "vortex", "blazed", "lens_array", "cubic", "quartic", "axilens",
+            "logarithmic_asphere" (`doedesign.design.starts`); or the path of a height map relative to the spec file.
         start_options: keyword arguments of the start.
         steps: optimisation steps; 0 evaluates the start.
         learning_rate: step size of Adam, in radians of phase at the design wavelength.
@@ -241,7 +242,7 @@ class OptimizeSpec(SpecTable, frozen=True):
 
     parametrization: Literal["freeform", "radial"] = "freeform"
     start: Start = "flat"
-    start_options: OptionsTable = Options()
+    start_options: OptionsTable = Field(default=Options(), examples=['{ angle = "1 deg" }'])
     steps: Steps = 200
     learning_rate: Positive = 0.1
     seed: Seed = 0
@@ -249,9 +250,9 @@ class OptimizeSpec(SpecTable, frozen=True):
     sampling: Literal["sparse", "exact"] = "sparse"
     colours: Literal["together", "in_turn"] = optional("together")
     polish: Steps = optional(0)
-    min_feature_m: Annotated[float, length(1 * NM, 1 * MM)] | None = optional()
+    min_feature_m: Annotated[float, length(1 * NM, 1 * MM)] | None = optional(example='"2 um"')
     wall_weight: NotNegative = optional(0.0)
-    drawn_pixel_m: Pitch | None = optional()
+    drawn_pixel_m: Pitch | None = optional(example='"3.7 um"')
     checkpoint_every: Count = 25
 
 
@@ -264,21 +265,22 @@ class ObjectiveSpec(SpecTable, frozen=True):
         options: keyword arguments of the term. `image` is a path relative to the spec file.
         colours: names of the colour channels it looks at; all of them if none is named.
         depths_m: depths of the scene it looks at; all of them if none is given.
-        over: "mean" of its colours and depths, or the "worst" of them. Where a term has depths of its own or asks for
-            the worst, every step looks at all depths, not at one near and one far one in turn.
+        over: "mean" of its colours and depths, or the "worst" of them. Where a term has depths of its own, asks for the
+            worst or has one answer for all depths, every step looks at all depths, not at one near and one far one in
+            turn.
     """
 
     name: ObjectiveName = Field(examples=['"far_spot"'])
     weight: Annotated[float, Field(strict=True)] = 1.0
-    options: OptionsTable = Options()
-    colours: tuple[ColourName, ...] = optional(())
-    depths_m: tuple[FarDepth, ...] = optional(())
+    options: OptionsTable = Field(default=Options(), examples=["{ energy = 0.4 }"])
+    colours: tuple[ColourName, ...] = optional((), example='["red"]')
+    depths_m: tuple[FarDepth, ...] = optional((), example='["5 m"]')
     over: Literal["mean", "worst"] = optional("mean")
 
     @property
     def compares(self) -> bool:
         """Whether it needs all depths of the scene at once."""
-        return bool(self.depths_m) or self.over == "worst"
+        return bool(self.depths_m) or self.over == "worst" or self.name in DEPTHS_OBJECTIVES
 
 
 class Spec(SpecTable, frozen=True):
@@ -289,6 +291,27 @@ class Spec(SpecTable, frozen=True):
     `[[area]]`.
 
     A file may leave out what its task says (`doedesign.spec.left_out`); here all is filled in.
+
+    Attributes:
+        name: name of the design, after which runs and mask sets are called.
+        optics: lens, colours and the way light is computed.
+        doe: cells, aperture and material.
+        process: levels, etches and errors.
+        scene: depths of obstruction and scene.
+        illumination: beam that lights the DOE; None for sources at the depths of the scene.
+        sensor: pixels and their response.
+        obstruction: objects that cover part of the view in captures; None for none.
+        optimize: how heights are sought.
+        objectives: terms of the loss.
+        spots: spots or orders; None without them.
+        areas: areas of light.
+        focus: foci on the axis; None without them.
+        limits: conditions of a good plate.
+        wafer: wafer, blanks and dies.
+        order: terms of a mask order.
+        robust: steps on plates as fabricated; None without them.
+        network: the reconstruction network.
+        train: its training.
     """
 
     name: SpecName = Field(examples=['"automotive"'])

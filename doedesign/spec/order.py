@@ -30,44 +30,44 @@ class OrderSpec(SpecTable, frozen=True):
     """Terms of a mask order; see `fab.order.terms.OrderTerms`.
 
     Attributes:
-        revision: of the order; in all names and on the masks.
+        revision: revision of the order, in all names and on the masks.
         contact: who answers questions.
         company: who orders.
-        purchase_order: its number.
+        purchase_order: number of the purchase order.
         ship_to: address that the masks are sent to.
         quantity: copies of each mask.
-        glass: of the mask blanks.
+        glass: glass of the mask blanks.
         blank_thickness_m: thickness of the mask blanks.
-        blank_flatness_m: their flatness.
-        chrome: on the mask blanks.
+        blank_flatness_m: flatness of the mask blanks.
+        chrome: chrome on the mask blanks.
         address_grid_m: address grid of the mask writer.
         cd_tolerance_m: largest error of a line width.
         registration_m: largest error of a place.
-        defect_class: of the mask shop.
+        defect_class: class of defects, in the mask shop's terms.
         defect_size_m: smallest defect that counts.
-        defects_per_cm2: how many of them are accepted.
-        pellicle: its kind, or "none".
+        defects_per_cm2: defects per cm² that are accepted.
+        pellicle: kind of the pellicle, or "none".
         remarks: anything else.
     """
 
     revision: Revision = optional("A")
-    contact: Text | None = optional()
-    company: Text | None = optional()
-    purchase_order: Text | None = optional()
-    ship_to: Text | None = optional()
-    quantity: Count | None = optional()
-    glass: Text | None = optional()
-    blank_thickness_m: Thickness | None = optional()
-    blank_flatness_m: Small | None = optional()
-    chrome: Text | None = optional()
-    address_grid_m: Small | None = optional()
-    cd_tolerance_m: Small | None = optional()
-    registration_m: Small | None = optional()
-    defect_class: Text | None = optional()
-    defect_size_m: Small | None = optional()
-    defects_per_cm2: NotNegative | None = optional()
-    pellicle: Text | None = optional()
-    remarks: Text | None = optional()
+    contact: Text | None = optional(example='"A. Person, +00 000 0000"')
+    company: Text | None = optional(example='"Example Optics"')
+    purchase_order: Text | None = optional(example='"PO-1234"')
+    ship_to: Text | None = optional(example='"1 Example Street"')
+    quantity: Count | None = optional(example="1")
+    glass: Text | None = optional(example='"quartz"')
+    blank_thickness_m: Thickness | None = optional(example='"2.3 mm"')
+    blank_flatness_m: Small | None = optional(example='"2 um"')
+    chrome: Text | None = optional(example='"100 nm, anti-reflective"')
+    address_grid_m: Small | None = optional(example='"5 nm"')
+    cd_tolerance_m: Small | None = optional(example='"0.1 um"')
+    registration_m: Small | None = optional(example='"0.1 um"')
+    defect_class: Text | None = optional(example='"A"')
+    defect_size_m: Small | None = optional(example='"1 um"')
+    defects_per_cm2: NotNegative | None = optional(example="0.1")
+    pellicle: Text | None = optional(example='"none"')
+    remarks: Text | None = optional(example='"send in one box"')
 
 
 class OrderFile(SpecTable, frozen=True):

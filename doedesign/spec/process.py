@@ -20,14 +20,26 @@ from pydantic import (
     model_validator,
 )
 
-from doedesign.spec.values import ColourName, FarDepth, NotNegative, bounded, broken, known, length, share
+from doedesign.spec.values import ColourName, FarDepth, InWords, NotNegative, bounded, broken, known, length, share
 from doedesign.spec.values.table import SpecTable, optional
 from fab.levels import FEWEST, MOST
 from fab.process import DEVIATIONS, Deviation, Normal
 from fab.stock import IDEAL, STOCK
 from fab.units import MM, NM, UM
 
-Quantity = Literal["zeroth_order", "strehl", "throughput", "outside_window", "ring_to_disc", "far_spot"]
+# The numbers of `sim.metrics.METRICS` that a plate can be good or bad by; the last four of spots, areas and foci.
+Quantity = Literal[
+    "zeroth_order",
+    "strehl",
+    "throughput",
+    "outside_window",
+    "ring_to_disc",
+    "far_spot",
+    "on_target",
+    "uniformity_error",
+    "contrast",
+    "focus_width",
+]
 
 Etch = Annotated[float, length(0.1 * NM, 1 * MM)]
 Feature = Annotated[float, length(0.0, 1 * MM)]
@@ -50,12 +62,17 @@ def _etch_depths(value: Any, info: ValidationInfo) -> tuple[float, ...] | Litera
 
 
 class EtchSpec(SpecTable, frozen=True):
-    """One etch; its depth is always that of `ProcessSpec.etch_depths_m`, and checked where it is given."""
+    """One etch.
+
+    Attributes:
+        mask: number of its mask, from 0, the shallowest of 2^k steps.
+        depth_m: its depth, which is that of `etch_depths` or of the levels; where given, it is checked against that.
+    """
 
     inline: ClassVar[bool] = True
 
     mask: Annotated[int, Field(strict=True, ge=0, le=5, examples=["0"])]
-    depth_m: Etch | None = optional()
+    depth_m: Etch | None = optional(example='"75 nm"')
 
 
 class SpreadSpec(SpecTable, frozen=True):
@@ -118,7 +135,11 @@ _Errors = create_model("_Errors", __base__=SpecTable, __module__=__name__, **_SP
 
 
 class ErrorsSpec(_Errors, frozen=True):
-    """How far the process strays: a `SpreadSpec` or None for each error of `fab.process.DEVIATIONS`, under its name."""
+    """How far the process strays: mean and standard deviation of every error of `fab.process.DEVIATIONS`.
+
+    A value alone is the standard deviation; `{ mean = ..., sigma = ... }` says both. An error that is not given is that
+    of the stock process, or zero without one.
+    """
 
 
 # Densities are per mm2 in a spec, where one per cm2 is 0.01, and per m2 elsewhere.
@@ -126,14 +147,23 @@ _PER_MM2 = {"particles_per_m2": "particles_per_mm2", "pinholes_per_m2": "pinhole
 
 
 class DefectsSpec(SpecTable, frozen=True):
-    """Rare events, as in `fab.process.Defects`: densities, mean radii, and the chances that an etch fails."""
+    """Rare events, as in `fab.process.Defects`: densities, mean radii, and the chances that an etch fails.
 
-    particles_per_mm2: Density | None = optional()
-    particle_radius_m: DefectRadius | None = optional()
-    pinholes_per_mm2: Density | None = optional()
-    pinhole_radius_m: DefectRadius | None = optional()
-    missed: Chance | None = optional()
-    doubled: Chance | None = optional()
+    Attributes:
+        particles_per_mm2: particles that keep an etch off the glass, per mm² and etch.
+        particle_radius_m: mean radius of the particles.
+        pinholes_per_mm2: pinholes of the chrome, per mm².
+        pinhole_radius_m: mean radius of the pinholes.
+        missed: probability that an etch is left out.
+        doubled: probability that an etch is done twice.
+    """
+
+    particles_per_mm2: Density | None = optional(example="0.01")
+    particle_radius_m: DefectRadius | None = optional(example='"2 um"')
+    pinholes_per_mm2: Density | None = optional(example="0.01")
+    pinhole_radius_m: DefectRadius | None = optional(example='"2 um"')
+    missed: Chance | None = optional(example="0.001")
+    doubled: Chance | None = optional(example="0.001")
 
     @classmethod
     def from_si(cls, values: Mapping[str, float]) -> "DefectsSpec":
@@ -161,7 +191,7 @@ class ProcessSpec(SpecTable, frozen=True):
         levels: number of heights L, from 2 to 64. As many masks are drawn as L - 1 has binary digits: 6 levels take the
             three masks of 8, and leave its two deepest floors unused.
         level_step_m: height of one level; `levels` times this is the height of one wave of the design.
-        etch_depths_m: depth of every mask, mask 0 first, where it is not 2^k level steps; "optimize" has
+        etch_depths_m: depth of every mask, first mask first, where it is not 2^k level steps; "optimize" has
             `doedesign optimize` choose them. Level L - 1 - c is etched by the masks of the binary digits of c.
         chrome_overlap_m: how far the chrome reaches over the edge of the relief, so that a chrome mask aligned a
             little off uncovers no blank glass. Light passes an opening of `doe.aperture` less twice this.
@@ -169,25 +199,31 @@ class ProcessSpec(SpecTable, frozen=True):
         etches: the etches in the order in which they are done, each mask once; shallow to deep where none is given.
         tone: what polygons mean on the plates, "clear" (dark-field plate) or "dark".
         minimum_line_m: narrowest line the lithography prints.
-        minimum_space_m: narrowest gap it prints.
+        minimum_space_m: narrowest gap the lithography prints.
         die_m: where on the wafer the DOE lies (y, x).
         wafer_radius_m: radius of the wafer.
         errors: how far the process strays.
         defects: rare events.
     """
 
-    levels: Annotated[int, Field(strict=True), AfterValidator(_level_count)] = Field(examples=["16"])
+    levels: Annotated[
+        int, Field(strict=True), AfterValidator(_level_count), InWords("whole number", f"{FEWEST} to {MOST}")
+    ] = Field(examples=["16"])
     level_step_m: Annotated[float, length(0.1 * NM, 100 * UM)] = Field(examples=['"75 nm"'])
     # Any, because a serialiser would be wary of a union.
-    etch_depths_m: Annotated[Any, PlainValidator(_etch_depths)] = optional()
+    etch_depths_m: Annotated[
+        Any,
+        PlainValidator(_etch_depths),
+        InWords(f'list of lengths, one per mask, or "{OPTIMIZE}"', "0.1 nm to 1 mm each"),
+    ] = optional(example='["80 nm", "150 nm", "300 nm", "600 nm"]')
     chrome_overlap_m: Annotated[float, length(0.0, 1 * MM)] = 5e-6
     stock: Annotated[str, known("process", STOCK)] | None = optional()
-    etches: tuple[EtchSpec, ...] = optional(())
+    etches: tuple[EtchSpec, ...] = optional((), example='[{ mask = 0, depth = "75 nm" }, { mask = 1 }]')
     tone: Literal["clear", "dark"] | None = optional()
-    minimum_line_m: Feature | None = optional()
-    minimum_space_m: Feature | None = optional()
-    die_m: tuple[Place, Place] | None = optional()
-    wafer_radius_m: Annotated[float, length(1 * MM, 1.0)] | None = optional()
+    minimum_line_m: Feature | None = optional(example='"1 um"')
+    minimum_space_m: Feature | None = optional(example='"1 um"')
+    die_m: tuple[Place, Place] | None = optional(example='["0 mm", "20 mm"]')
+    wafer_radius_m: Annotated[float, length(1 * MM, 1.0)] | None = optional(example='"50 mm"')
     errors: ErrorsSpec = optional(ErrorsSpec())
     defects: DefectsSpec = optional(DefectsSpec())
 
@@ -229,6 +265,10 @@ class ProcessSpec(SpecTable, frozen=True):
         return self.model_copy(update=usual | self.given() | tables)
 
 
+# Numbers that may exceed 1.
+_RATIOS = ("ring_to_disc", "contrast", "focus_width")
+
+
 class LimitSpec(SpecTable, frozen=True):
     """One condition of a good plate: it must hold for every colour and depth it applies to.
 
@@ -241,16 +281,16 @@ class LimitSpec(SpecTable, frozen=True):
     """
 
     quantity: Quantity = Field(examples=['"zeroth_order"'])
-    min: NotNegative | None = optional()
-    max: NotNegative | None = optional()
-    colour: ColourName | None = optional()
-    depth_m: FarDepth | None = optional()
+    min: NotNegative | None = optional(example="0.6")
+    max: NotNegative | None = optional(example="0.05")
+    colour: ColourName | None = optional(example='"red"')
+    depth_m: FarDepth | None = optional(example='"5 m"')
 
     @field_validator("min", "max")
     @classmethod
     def _a_share(cls, value: float | None, info: ValidationInfo) -> float | None:
         quantity = info.data.get("quantity", "ring_to_disc")
-        if value is not None and value > 1 and quantity != "ring_to_disc":
+        if value is not None and value > 1 and quantity not in _RATIOS:
             raise broken(f"must lie between 0 and 1, for {quantity} is a share", "Write 5 % as 0.05.")
         return value
 

@@ -31,7 +31,7 @@ from fab.units import NM
 
 RESPONSE_KEYS = ("spectral_response", "lines_per_colour")
 
-_LINES, _MOST_LINES = 5, 16
+LINES, MOST_LINES = 5, 16
 _CURE = "Give wavelengths in nm and one column per colour, as in `550,0.1,0.9,0.2`."
 
 
@@ -49,15 +49,15 @@ def with_response(raw: Mapping[str, Any], source: Path) -> dict[str, Any]:
     if not isinstance(optics, dict) or not any(key in optics for key in RESPONSE_KEYS):
         return dict(raw)
     where = f"{source}: optics"
-    name, count = optics.get("spectral_response"), optics.get("lines_per_colour", _LINES)
+    name, count = optics.get("spectral_response"), optics.get("lines_per_colour", LINES)
     if not isinstance(name, str):
         rule = "must be the name of a CSV file in quotes"
         raise InputError(f"{where}.spectral_response", rule, name, 'For example spectral_response = "camera.csv".')
     if twice := [key for key in ("wavelengths", "colours") if key in optics]:
         got = f"`spectral_response` and `{twice[0]}`"
         raise InputError(f"{where}.{twice[0]}", "the colours must be stated once", got, "Remove one of the two.")
-    if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= _MOST_LINES:
-        rule = f"must be a whole number from 1 to {_MOST_LINES}"
+    if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= MOST_LINES:
+        rule = f"must be a whole number from 1 to {MOST_LINES}"
         raise InputError(f"{where}.lines_per_colour", rule, count, "Five lines are enough for most cameras.")
     colours = []
     for response in read_responses(source.parent / name):

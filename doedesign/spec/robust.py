@@ -22,7 +22,7 @@ class RobustSpec(SpecTable, frozen=True):
             sign in a step, or else all of them.
         measure: risk that the steps minimise, of the losses of these plates: their "mean"; "cvar", the mean of the
             worst; or "yield", the share of plates whose loss exceeds `limit`, with a soft edge.
-        share: of the plates, that "cvar" looks at.
+        share: share of the plates, the worst ones, that "cvar" looks at.
         limit: loss of a good plate, for "yield".
         walls: cost of a wall of a mask, as a multiple of the light that goes astray beside it where the mask is off by
             the process's errors of its edges, as if its neighbours stayed.
@@ -36,7 +36,7 @@ class RobustSpec(SpecTable, frozen=True):
     draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 4
     measure: Literal["mean", "cvar", "yield"] = "mean"
     share: Annotated[float, Field(strict=True, gt=0, le=1)] = 0.5
-    limit: Positive | None = optional()
+    limit: Positive | None = optional(example="1.5")
     walls: NotNegative = 0.3
     depths: Literal["listed", "range"] = "listed"
     field: Literal["off", "random"] = "off"

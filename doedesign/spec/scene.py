@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from math import sin
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from doedesign.spec.values import (
     ANGLE,
@@ -16,6 +16,7 @@ from doedesign.spec.values import (
     FarDepth,
     NearDepth,
     NotNegative,
+    OneOrList,
     Options,
     OptionsTable,
     Pitch,
@@ -33,7 +34,7 @@ Occlusion = Literal["radiometric", "reciprocal", "paper", "paper_release"]
 Noise = Literal["physical", "tseng", "release", "none"]
 Bayer = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 OCCLUSION_MODELS, NOISE_MODELS, BAYER_PATTERNS = get_args(Occlusion), get_args(Noise), get_args(Bayer)
-OBSTRUCTION_KINDS = ("fence", "raindrop", "dirt", "dirt_raindrop")
+OBSTRUCTION_KINDS = ("fence", "raindrop", "dirt", "dirt_raindrop", "dirt_raindrop_fence")
 OBSTRUCTION_KINDS += ("release_fence", "release_raindrop", "release_dirt", "folder")
 
 
@@ -43,7 +44,7 @@ def _as_list(value: Any) -> Any:
 
 
 Efficiency = Annotated[float, Field(strict=True, gt=0, le=1)]
-Efficiencies = Annotated[tuple[Efficiency, ...], BeforeValidator(_as_list)]
+Efficiencies = Annotated[tuple[Efficiency, ...], OneOrList(_as_list)]
 
 
 class SceneSpec(SpecTable, frozen=True):
@@ -57,7 +58,7 @@ class SceneSpec(SpecTable, frozen=True):
             "paper_release" what the paper's public code does.
     """
 
-    near_m: tuple[NearDepth, ...] = ()
+    near_m: tuple[NearDepth, ...] = Field(default=(), examples=['["5 cm"]'])
     far_m: tuple[FarDepth, ...] = Field(min_length=1, examples=['["5 m", "10 m"]'])
     occlusion: Occlusion | None = optional()
 
@@ -85,19 +86,19 @@ class IlluminationSpec(SpecTable, frozen=True):
         distance_m: distance of a point before the DOE.
         angles_rad: [x, y] between the beam's axis and that of the DOE, positive where light travels toward +x or +y.
             Images lie about the axis of the beam.
-        tilt_rad: the same for a sensor that stays where it is: images move by distance x sin(tilt), the focal length
-            being the distance behind a lens, or by the angle itself where there is no sensor. Far field only. Spots and
-            areas stay where they are asked for; orders of a unit cell move.
+        tilt_rad: [x, y] of the beam against the axis of the DOE, for a sensor that stays where it is: images move by
+            distance x sin(tilt), the focal length being the distance behind a lens, or by the angle itself where there
+            is no sensor. Far field only. Spots and areas stay where they are asked for; orders of a unit cell move.
     """
 
     kind: Literal["plane", "gaussian", "picture", "point"] = "gaussian"
-    diameters_m: Annotated[tuple[Diameter, ...], BeforeValidator(_as_list)] = optional(())
+    diameters_m: Annotated[tuple[Diameter, ...], OneOrList(_as_list)] = optional((), example='"5 mm"')
     waist_distance_m: Annotated[float, length(-100.0, 100.0)] = optional(0.0)
-    m_squared: Annotated[tuple[Quality, ...], BeforeValidator(_as_list)] = optional((1.0,))
-    picture: str | None = optional()
-    pixel_m: Annotated[float, length(10 * NM, 10 * MM)] | None = optional()
+    m_squared: Annotated[tuple[Quality, ...], OneOrList(_as_list)] = optional((1.0,))
+    picture: str | None = optional(example='"beam.png"')
+    pixel_m: Annotated[float, length(10 * NM, 10 * MM)] | None = optional(example='"3.45 um"')
     centre_m: tuple[Axis, Axis] = optional((0.0, 0.0))
-    distance_m: FarDepth | None = optional()
+    distance_m: FarDepth | None = optional(example='"10 cm"')
     angles_rad: tuple[Tilt, Tilt] = optional((0.0, 0.0))
     tilt_rad: tuple[Tilt, Tilt] = optional((0.0, 0.0))
 
@@ -106,14 +107,15 @@ class ObstructionSpec(SpecTable, frozen=True):
     """Obstruction in front of the scene.
 
     Attributes:
-        kind: one of `OBSTRUCTION_KINDS`.
+        kind: kind of obstruction; a mixed kind is one of its parts, by lot.
         options: physical parameters of the kind where they are not its usual ones (`sim.obstruction`): lengths and
             angles as text with a unit, ranges as lists of two. Its distance is `depth`; unless given, it lies between
-            the nearest and the farthest of `scene.near`.
+            the nearest and the farthest of `scene.near`. In a mixed kind an option begins with the name of its part,
+            such as `dirt_clump`.
     """
 
     kind: Annotated[str, known("kind of obstruction", OBSTRUCTION_KINDS)] = Field(examples=['"dirt"'])
-    options: OptionsTable = optional(Options())
+    options: OptionsTable = optional(Options(), example='{ depth = ["5 cm", "8 cm"] }')
 
 
 class SensorSpec(SpecTable, frozen=True):
@@ -144,21 +146,21 @@ class SensorSpec(SpecTable, frozen=True):
 
     angles: ClassVar = {"pixel_angle_rad": ANGLE}
 
-    pitch_m: Pitch | None = optional()
-    pixel_angle_rad: Annotated[float, bounded("rad", 1e-8, 1.2)] | None = optional()
-    resolution: tuple[Count, Count] | None = optional()
+    pitch_m: Pitch | None = optional(example='"1.85 um"')
+    pixel_angle_rad: Annotated[float, bounded("rad", 1e-8, 1.2)] | None = optional(example='"0.005 deg"')
+    resolution: tuple[Count, Count] | None = optional(example="[4000, 3000]")
     binning: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
     fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
     defocus_m: Annotated[float, length(-10 * MM, 10 * MM)] = 0.0
-    distance_m: Annotated[float, length(1 * UM, 1e6)] | None = optional()
-    full_well_e: Positive | None = optional()
-    exposure: Annotated[float, Field(strict=True, gt=0, le=100)] | None = optional()
-    quantum_efficiency: Efficiencies = optional(())
-    read_noise_e: NotNegative | None = optional()
-    dark_e: NotNegative | None = optional()
-    black_level: NotNegative | None = optional()
-    bits: Annotated[int, Field(strict=True, ge=1, le=16)] | None = optional()
+    distance_m: Annotated[float, length(1 * UM, 1e6)] | None = optional(example='"50 mm"')
+    full_well_e: Positive | None = optional(example="10000.0")
+    exposure: Annotated[float, Field(strict=True, gt=0, le=100)] | None = optional(example="0.8")
+    quantum_efficiency: Efficiencies = optional((), example="[0.5, 0.6, 0.55]")
+    read_noise_e: NotNegative | None = optional(example="2.5")
+    dark_e: NotNegative | None = optional(example="1.0")
+    black_level: NotNegative | None = optional(example="64.0")
+    bits: Annotated[int, Field(strict=True, ge=1, le=16)] | None = optional(example="12")
     bayer: Bayer | None = optional()
     noise: Noise | None = optional()
 

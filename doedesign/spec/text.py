@@ -14,6 +14,8 @@ from fab.files import canonical_json, sha256_bytes
 from fab.process import Variation
 from fab.units import parse_angle
 
+_FILLED_IN = "defaults are filled in; optional keys that are not here have their usual values"
+
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:
     """Return a spec as plain values in SI units, with the defaults filled in except those of optional keys."""
@@ -26,7 +28,10 @@ def spec_digest(spec: Spec) -> str:
 
 
 def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
-    """Write a spec with every default filled in, as TOML that reads back to the same spec; `comments` come first."""
+    """Write a spec as TOML that reads back to the same spec, `comments` first.
+
+    Defaults are filled in, except those of optional keys, which are left out as long as they have their usual value.
+    """
     lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
     in_angles = isinstance(spec, Spec) and spec.sensor.in_angles
     return "\n".join(lines + _table_lines(spec, "", in_angles)).strip() + "\n"
@@ -34,7 +39,7 @@ def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
 
 def spec_to_resolved_toml(spec: Spec, overrides: Sequence[str]) -> str:
     """Write the spec of a run; the head of the file tells the overrides, "table.key=value", that led to it."""
-    return spec_to_toml(spec, ["every default filled in", *(f"--set {override}" for override in overrides)])
+    return spec_to_toml(spec, [_FILLED_IN, *(f"--set {override}" for override in overrides)])
 
 
 def process_to_toml(process: ProcessSpec, comments: Sequence[str] = ()) -> str:
@@ -60,7 +65,7 @@ def _table_lines(table: SpecTable, path: str, in_angles: bool = False) -> list[s
                 tables += ["", f"[[{inner}]]", *_table_lines(item, inner, in_angles)]
         elif name != "objectives":  # an empty array of tables is written as none
             kind = table.angles.get(name) if in_angles else None
-            values.append(f"{key} = {_text(name, value) if kind is None else _angle_text(value, kind)}")
+            values.append(f"{key} = {toml_value(name, value) if kind is None else _angle_text(value, kind)}")
     return values + tables
 
 
@@ -72,16 +77,16 @@ def _angle_text(value: Any, kind: HeldAngle) -> str:
     return f'"{next((text for text in texts if kind.held(parse_angle(text)) == value), texts[-1])}"'
 
 
-def _text(name: str, value: Any) -> str:
+def toml_value(name: str, value: Any) -> str:
     """Write a value in the unit that an attribute's name ends in."""
     if isinstance(value, tuple):
-        return f"[{', '.join(_text(name, item) for item in value)}]"
+        return f"[{', '.join(toml_value(name, item) for item in value)}]"
     if isinstance(value, SpreadSpec):
         # Its parts have the unit of the error they belong to.
-        parts = [f"{key} = {_text(name, part)}" for key, part in value.given().items()]
-        return f"{{ {', '.join(parts)} }}" if "mean" in value.given() else _text(name, value.sigma)
+        parts = [f"{key} = {toml_value(name, part)}" for key, part in value.given().items()]
+        return f"{{ {', '.join(parts)} }}" if "mean" in value.given() else toml_value(name, value.sigma)
     if isinstance(value, SpecTable):
-        return f"{{ {', '.join(f'{toml_key(key)} = {_text(key, part)}' for key, part in value.given().items())} }}"
+        return f"{{ {', '.join(f'{toml_key(key)} = {toml_value(key, part)}' for key, part in value.given().items())} }}"
     if isinstance(value, str):
         return _value_text(value)
     if value == math.inf:

@@ -9,12 +9,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from doedesign.spec.values import Count, NotNegative, Positive, Seed, Steps
-from doedesign.spec.values.table import SpecTable
+from doedesign.spec.values.table import SpecTable, optional
 from fab.errors import InputError
 
 USUAL_SIZE = 512
 
 Flag = Annotated[bool, Field(strict=True)]
+PictureShare = Annotated[float, Field(strict=True, gt=0, le=1)]
 
 
 class NetworkSpec(SpecTable, frozen=True):
@@ -25,10 +26,13 @@ class NetworkSpec(SpecTable, frozen=True):
             12 times as many.
         depth: scales below the finest.
         wiener: Wiener blocks, which undo the far PSF, at every scale ("inverse filter").
-        features: what they see is learnt; otherwise it is the capture itself ("feature extraction").
+        features: the features that the Wiener blocks see are learnt; otherwise they see the capture itself ("feature
+            extraction").
         near_estimate: the near-PSF Wiener estimate stands beside the capture at the input.
         refine: the second stage of three residual blocks ("residual block").
         variant: "paper", or "release" for what the paper's public code does where the two differ.
+        global_light: a branch of low resolution sees the whole picture and undoes veil and gain before the local ones
+            (`doedesign.recon.global_light`); not with "release".
     """
 
     width: Annotated[int, Field(strict=True, ge=1, le=256)] = 12
@@ -38,6 +42,7 @@ class NetworkSpec(SpecTable, frozen=True):
     near_estimate: Flag = True
     refine: Flag = True
     variant: Literal["paper", "release"] = "paper"
+    global_light: Flag = optional(False)
 
 
 class TrainSpec(SpecTable, frozen=True):
@@ -52,7 +57,7 @@ class TrainSpec(SpecTable, frozen=True):
             the map as it is.
         schedule: "cosine" lets both step sizes fall to a tenth, "constant" keeps them.
         mode: "simultaneous", or "alternating": the optics moves in one of `period` steps, the network in the others.
-        period: see `mode`.
+        period: steps of which one moves the optics, where `mode` is "alternating".
         freeze: what stays as it is: "none", "optics" or "network".
         camera: "doe", or "conventional" for the same camera with a flat plate.
         l1: weight of the mean absolute difference.
@@ -65,7 +70,13 @@ class TrainSpec(SpecTable, frozen=True):
         seed: seed of everything random.
         checkpoint_every: steps between checkpoints.
         validate_every: steps between looks at pictures that are never trained on.
-        validation: number of these pictures.
+        validation: number of pictures that are never trained on.
+        zoom: least and greatest share of a picture's shorter side that a crop spans, drawn at random and brought to
+            `size`, such as [0.4, 1.0]; without it crops are the picture's own pixels (of at most twice `size`).
+        light_scenes: scenes by which the branch of `network.global_light` learns by itself before the first step, such
+            as 2400: they cost little, and it begins where the steps would bring it late.
+        average: what a running mean of the network's weights keeps of itself in a step, such as 0.995; the mean is
+            judged and written. 0 for the weights of the last step.
     """
 
     steps: Steps = 50_000
@@ -89,6 +100,9 @@ class TrainSpec(SpecTable, frozen=True):
     checkpoint_every: Count = 200
     validate_every: Count = 500
     validation: Annotated[int, Field(strict=True, ge=1, le=10_000)] = 8
+    zoom: tuple[PictureShare, PictureShare] | None = optional(example="[0.4, 1.0]")
+    light_scenes: Annotated[int, Field(strict=True, ge=0, le=1_000_000)] = optional(0)
+    average: Annotated[float, Field(strict=True, ge=0, lt=1)] = optional(0.0)
 
     @property
     def moves_optics(self) -> bool:
@@ -111,6 +125,15 @@ def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> I
     if not (network.features or network.wiener):
         cure = "Keep one of the two blocks."
         yield InputError("network.features", "features or wiener must be kept", "neither", cure)
+    if network.global_light and network.variant == "release":
+        rule, cure = 'must be left out of variant = "release", which has no veil and gain', "Remove one of the two."
+        yield InputError("network.global_light", rule, "true", cure)
+    if train.zoom is not None and train.zoom[0] > train.zoom[1]:
+        rule = "must be two shares of a picture, the smaller first"
+        yield InputError("train.zoom", rule, str(list(train.zoom)), f"Set zoom = {sorted(train.zoom)}.")
+    if train.light_scenes and not network.global_light:
+        rule, cure = "needs the branch that is to learn from them", "Set network.global_light = true."
+        yield InputError("train.light_scenes", rule, str(train.light_scenes), cure)
     # Two pixels at the coarsest scale: reflection at its border needs a neighbour.
     coarsest = 2**network.depth
     if train.size % coarsest or train.size < 2 * coarsest:

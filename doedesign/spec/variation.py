@@ -51,12 +51,18 @@ class VariationSpec(_Values, frozen=True):
         seed: which roughness, of all with the same statistics.
     """
 
-    repeats: tuple[Annotated[int, Field(strict=True, ge=-1, le=9)], ...] = optional(())
+    repeats: tuple[Annotated[int, Field(strict=True, ge=-1, le=9)], ...] = optional((), example="[0, 0, -1, 0]")
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = optional(0)
 
 
 class PinholeSpec(SpecTable, frozen=True):
-    """A pinhole in the chrome; see `fab.process.Disc`."""
+    """A pinhole in the chrome (`fab.process.Disc`).
+
+    Attributes:
+        x_m: place of its middle from the middle of the DOE, +x to the right as seen along the light.
+        y_m: the same, +y up.
+        radius_m: its radius.
+    """
 
     x_m: Place = Field(examples=['"0.1 mm"'])
     y_m: Place = Field(examples=['"0.1 mm"'])
@@ -64,7 +70,14 @@ class PinholeSpec(SpecTable, frozen=True):
 
 
 class ParticleSpec(SpecTable, frozen=True):
-    """A particle that kept one etch off a disc; see `fab.process.MaskDisc`."""
+    """A particle that kept one etch off a disc (`fab.process.MaskDisc`).
+
+    Attributes:
+        mask: number of the mask whose etch it kept off, from 0.
+        x_m: place of its middle from the middle of the DOE, +x to the right as seen along the light.
+        y_m: the same, +y up.
+        radius_m: its radius.
+    """
 
     mask: Annotated[int, Field(strict=True, ge=0, le=5, examples=["0"])]
     x_m: Place = Field(examples=['"0.1 mm"'])
@@ -73,7 +86,13 @@ class ParticleSpec(SpecTable, frozen=True):
 
 
 class VariationFile(SpecTable, frozen=True):
-    """TOML file of the errors of one DOE."""
+    """TOML file of the errors of one plate.
+
+    Attributes:
+        variation: the errors.
+        particles: particles that kept an etch off.
+        pinholes: pinholes in the chrome.
+    """
 
     variation: VariationSpec
     particles: tuple[ParticleSpec, ...] = optional(())

@@ -23,7 +23,7 @@ class WaferSpec(SpecTable, frozen=True):
 
     Attributes:
         diameter_m: diameter of the wafer.
-        thickness_m: its thickness.
+        thickness_m: thickness of the wafer.
         blank_m: edge of the square mask blanks.
         dies: rows and columns of dies; as many as fit if none are given.
         pitch_m: distance of the dies; the next whole millimetre that a die and a saw lane need if none is given.
@@ -35,24 +35,24 @@ class WaferSpec(SpecTable, frozen=True):
         compensate: whether masks are drawn against the mean line-width bias of the process.
         line_splits_m: for each entry some dies whose edges of etched areas are drawn so much further out.
         order_control: whether some dies draw the planes in the opposite order of depths.
-        edge_moves_m: how far masks are drawn with the edges of etched areas further out, mask 0 first; in place of
+        edge_moves_m: how far masks are drawn with the edges of etched areas further out, first mask first; in place of
             `compensate`.
     """
 
     diameter_m: Size = optional(_USUAL.diameter_m)
     thickness_m: Thickness = optional(_USUAL.thickness_m)
     blank_m: Size = optional(_USUAL.blank_m)
-    dies: tuple[Dies, Dies] | None = optional()
-    pitch_m: Size | None = optional()
+    dies: tuple[Dies, Dies] | None = optional(example="[3, 3]")
+    pitch_m: Size | None = optional(example='"10 mm"')
     lane_m: Rim = optional(_USUAL.lane_m)
     edge_exclusion_m: Rim = optional(_USUAL.edge_exclusion_m)
     chrome_to_edge: Annotated[bool, Field(strict=True)] = optional(_USUAL.chrome_to_edge)
     zero_layer: Annotated[bool, Field(strict=True)] = optional(_USUAL.zero_layer)
     chrome: Literal["liftoff", "etch"] = optional(_USUAL.chrome)
     compensate: Annotated[bool, Field(strict=True)] = optional(_USUAL.compensate)
-    line_splits_m: tuple[Move, ...] = optional(_USUAL.line_splits_m)
+    line_splits_m: tuple[Move, ...] = optional(_USUAL.line_splits_m, example='["-0.2 um", "0.2 um"]')
     order_control: Annotated[bool, Field(strict=True)] = optional(_USUAL.order_control)
-    edge_moves_m: tuple[Move, ...] = optional(_USUAL.edge_moves_m)
+    edge_moves_m: tuple[Move, ...] = optional(_USUAL.edge_moves_m, example='["0.1 um", "0.1 um", "0.05 um", "0 um"]')
 
 
 class WaferFile(SpecTable, frozen=True):

@@ -9,15 +9,15 @@ from jaxtyping import Float, UInt8
 
 from doedesign.build import camera_from_spec, levels_from_spec, process_from_spec
 from doedesign.design.design import Design
-from doedesign.design.patterns import spot_centres_m
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec
-from doedesign.spec.targets.spots import MOST_CELLS, SpotsSpec
+from doedesign.spec.targets.arrangements import grid_orders
+from doedesign.spec.targets.spots import MOST_CELLS, SpotsSpec, places_of
 from doedesign.spots.exchange import exchange
 from doedesign.spots.orders import OrderTable, order_table
 from doedesign.spots.plates import SpotPlates, plates_of
 from doedesign.spots.search import search_phases, search_points
-from doedesign.spots.spots import Spots, grid_orders, hexagonal_places, ring_places, shares_of
+from doedesign.spots.spots import Spots, shares_of
 from doedesign.spots.superposition import SpotLight, SpotProblem, Staircase, WaveSet
 from fab.draws import varying
 from fab.errors import InputError
@@ -288,7 +288,7 @@ def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
         assert table.count is not None
         orders, step = grid_orders(table.count), 1 / table.period_m
         return Spots(orders * step, shares, orders, (step, step), phases)
-    places = _places_m(table)
+    places = places_of(table)
     middle = np.array(table.offset_m[::-1])
     sines = np.stack(camera.sines_of(*(places + middle).T), axis=1) - np.array(camera.moved_sines())
     if table.arrangement != "grid" or middle.any() or not camera.images_alike:
@@ -298,15 +298,3 @@ def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
     spacing = table.spacing_m / (2 if any(n % 2 == 0 for n in table.count or ()) else 1)
     step = spacing / camera.sensor_distance_m / wavelength
     return Spots(sines / wavelength, shares, np.rint(places / spacing).astype(int), (step, step), phases)
-
-
-def _places_m(table: SpotsSpec) -> Float[np.ndarray, "m 2"]:
-    """Places (y, x) on the sensor, about the middle of the arrangement."""
-    if table.arrangement == "list":
-        return np.array([place[::-1] for place in table.places_m])
-    if table.arrangement == "hexagonal":
-        return hexagonal_places(table.rings or 0, table.spacing_m or 0.0)
-    if table.arrangement == "ring":
-        return ring_places(table.number or 0, table.radius_m or 0.0)
-    assert table.count is not None
-    return spot_centres_m(table.count, table.spacing_m or 0.0)

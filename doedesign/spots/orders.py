@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from doedesign.design.given_wave import WaveShare
+from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
 from fab.aperture import RoundAperture
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
+# Spot widths from a spot within which light that goes straight on is its light.
+_AT_THE_ZEROTH = 0.5
 _AROUND = 3  # orders beyond the spots among which stray light is looked for
 
 # Efficiency of equal spots by a DOE of any phase: the best that is known, columns by rows.
@@ -84,6 +87,7 @@ class OrderTable:
         unit: in which places are told.
         phase_errors: `[spot]` phases less those that are given, radians, after the best common one; None where free.
         wave: how much light is in the wave of the phases that are given; None where they are free.
+        zeroth_order_wanted: whether a spot lies where light goes straight on, so that the 0th order is no leakage.
     """
 
     spots: Spots
@@ -97,10 +101,16 @@ class OrderTable:
     unit: PlaceUnit = MILLIMETRES
     phase_errors: Float[np.ndarray, " m"] | None = None
     wave: WaveShare | None = None
+    zeroth_order_wanted: bool = False
 
     @property
     def total(self) -> float:
-        """Share of the light on all spots."""
+        """Share of the light on all spots.
+
+        For orders of a unit cell, summed over whole periods in a disc or a rectangle, it is at most 1. Spots apart
+        each count a little of their neighbours' light, less than 2 % of that of one at the least distance of a spec
+        (`doedesign.spec.targets.spots`), so that their total may be some percent too large.
+        """
         return float(self.efficiency.sum())
 
     @property
@@ -126,10 +136,11 @@ class OrderTable:
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""
         return (self.wave.summary() if self.wave else {}) | {
-            "efficiency": self.total,
+            "on_target": self.total,
             "uniformity_error": self.uniformity_error,
             "rmse": self.rmse,
-            "zeroth_order": self.zeroth_order,
+            "zeroth_order_efficiency": self.zeroth_order,
+            "zeroth_order_wanted": self.zeroth_order_wanted,
             "strongest_stray": self.strongest_stray,
             "signal_to_noise": self.signal_to_noise,
             "ceiling": self.ceiling.efficiency,
@@ -147,10 +158,11 @@ class OrderTable:
         """One line."""
         bound = "none known" if self.ceiling.efficiency is None else f"{100 * self.ceiling.efficiency:.1f} %"
         wave = f", {self.wave}" if self.wave else ""
+        wanted = f" ({ONE_OF_THE_SPOTS})" if self.zeroth_order_wanted else ""
         return (
             f"{self.spots.count} spots: {100 * self.total:.2f} % of the light (ceiling: {bound}), uniformity error "
-            f"{100 * self.uniformity_error:.2f} %{wave}, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
-            f"{100 * (1 - self.fresnel):.1f} % apart"
+            f"{100 * self.uniformity_error:.2f} %{wave}, 0th order {100 * self.zeroth_order:.3f} %{wanted}; Fresnel "
+            f"loss of {100 * (1 - self.fresnel):.1f} % apart"
         )
 
     def to_csv(self) -> str:
@@ -192,12 +204,12 @@ def order_table(
     Args:
         optic: the DOE; its first wavelength is looked at.
         spots: where light should go.
-        period_m: side of a unit cell that is repeated. Only whole periods within the aperture, in a square if it is
-            round, are looked at, as if there were no end of them: behind a round aperture the feet of bright neighbours
-            add to a peak.
+        period_m: side of a unit cell that is repeated, metres. Only whole periods within the aperture, in a square if
+            it is round, are looked at, as if there were no end of them: behind a round aperture the feet of bright
+            neighbours add to a peak.
         count: columns and rows of a grid of equal spots, for the ceiling.
         levels: levels of the DOE, for the ceiling.
-        depth_m: distance of the source.
+        depth_m: distance of the source, metres.
     """
     camera, line = optic.camera, optic.camera.lines[0]
     # Directions are what a lens would show in its focus, whatever the light on the DOE and the way behind it.
@@ -230,6 +242,7 @@ def order_table(
         camera.told_in(MILLIMETRES),
         errors,
         wave,
+        bool(np.any(np.hypot(*(spots.waves_per_m * camera.opening.widest_m).T) < _AT_THE_ZEROTH)),
     )
 
 

@@ -7,9 +7,8 @@
 
 Reading order (`fab.draws` says which draws there are; each has a key from which it can be made again alone):
 
-    pool          draws on all cores of this machine
-    cluster       draws on a Dask cluster
-    journal       finished draws on the disk
+    pool          draws as items of work
+    journal       lines of finished draws on the disk
     analysis      statistics, limits, yield
     sensitivity   which errors matter
     budget        how large an error may be
@@ -17,5 +16,5 @@ Reading order (`fab.draws` says which draws there are; each has a key from which
     results       the usual questions behind one function
     result_files  its files; plots draws its pictures
 
-Nothing is imported here: a worker that imports `pool` or `cluster` must set up its threads before jax is loaded.
+Nothing is imported here: a worker that imports `pool` must set up its threads before jax is loaded.
 """

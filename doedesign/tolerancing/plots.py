@@ -16,7 +16,7 @@ from doedesign.report.labels import error_label
 from doedesign.tolerancing.analysis import QUANTITIES, Sample, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.sensitivity import Effect, VarianceShare
-from fab.figure import INK, LINE, MARK, SERIES, length_text, panels, single
+from fab.figure import INK, LINE, MARK, SERIES, legend_above, length_text, panels, single
 from fab.process import DEVIATIONS
 from sim.plots.colours import colour_label, line_colours
 
@@ -46,21 +46,22 @@ def _per_quantity(
     ax: "Axes | None",
     quantities: Sequence[str],
     note: str,
+    title: str,
     keys: Sequence["Line2D"] = (),
     size_in: tuple[float, float] = (3.35, 2.5),
 ) -> "Iterator[tuple[FigureBase, list[Axes]]]":
-    """One panel of a size per quantity under a legend."""
+    """One panel of a size per quantity under a title and a legend."""
     columns = max(min(len(quantities), _COLUMNS), 1)
     rows = max(math.ceil(len(quantities) / columns), 1)
-    size = (max(columns * size_in[0], 4.5), rows * size_in[1] + 0.5 + (0.2 if keys else 0.0))
-    with panels(ax, size, note=note) as figure:
+    size = (max(columns * size_in[0], 4.5), rows * size_in[1] + 0.85 + (0.2 if keys else 0.0))
+    with panels(ax, size, "" if keys else title, note) as figure:
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes, quantity in zip(grid, map(QUANTITIES.__getitem__, quantities), strict=False):
             axes.set(title=quantity.label, xlabel=quantity.label + (" (%)" if quantity.share else ""))
         for spare in grid[len(quantities) :]:
             spare.set_axis_off()
         if keys:
-            figure.legend(handles=list(keys), loc="outside upper left", ncols=len(keys), borderpad=0.0)
+            legend_above(figure, keys, title)
         yield figure, grid[: len(quantities)]
 
 
@@ -85,7 +86,7 @@ def plot_histograms(sample: Sample, nominal: Sample, camera: "Camera", ax: "Axes
     words += "; shaded: beyond the limit" if sample.limits else ""
     missing = int((~sample.within).sum())
     words += f"; {missing} beyond the model are not shown" if missing else ""
-    with _per_quantity(ax, list(sample.values), words, _colour_keys(camera)) as (figure, grid):
+    with _per_quantity(ax, list(sample.values), words, "Plates as fabricated", _colour_keys(camera)) as (figure, grid):
         for axes, quantity in zip(grid, sample.values, strict=True):
             scale = _scale(quantity)
             series = {c: scale * _finite(sample.worst(quantity, c)) for c in sample.colours}
@@ -141,7 +142,7 @@ def plot_yield(sample: Sample, ax: "Axes | None" = None) -> "FigureBase":
     words = f"share of {len(sample.keys)} plates that are good if the limit lies there, with its 95 % confidence"
     if limits:
         words += f"; all limits together: {sample.yield_}"
-    with _per_quantity(ax, chosen, words) as (figure, grid):
+    with _per_quantity(ax, chosen, words, "Yield over where the limit lies") as (figure, grid):
         for axes, quantity in zip(grid, chosen, strict=True):
             places = {(one.colour, one.depth_m) for one in limits if one.quantity == quantity} or {(None, None)}
             curves = {place: sample.worst(quantity, *place) for place in sorted(places, key=str)}
@@ -187,7 +188,8 @@ def plot_effects(effects: Sequence[Effect], ax: "Axes | None" = None) -> "Figure
     words = "worst colour and depth; every error alone, all others at their mean (the line)"
     sides = ((_LOWER, "lower"), (_HIGHER, "higher"))
     keys = [Line2D([], [], color=hue, lw=5, label=f"one sigma {side}") for hue, side in sides]
-    with _per_quantity(ax, quantities, words, keys, (4.4, 1.1 + 0.17 * count)) as (figure, grid):
+    size = (4.4, 1.1 + 0.17 * count)
+    with _per_quantity(ax, quantities, words, "Effect of every error alone", keys, size) as (figure, grid):
         for axes, quantity in zip(grid, quantities, strict=True):
             shown = sorted((c for c in worst if c.quantity == quantity), key=_reach, reverse=True)[:_MOST_BARS]
             _plot_bars(axes, shown, _scale(quantity))
@@ -227,8 +229,8 @@ def plot_variance_shares(shares: Sequence[VarianceShare], camera: "Camera", ax: 
     sources += [s for s in dict.fromkeys(one.source for one in shares) if s not in sources]
     words = "Sobol indices of the worst colour and depth: dark alone, light together with others, with 95 % confidence"
     words += "; marks: totals of single colours"
-    keys = _colour_keys(camera, ls="", marker="|", mew=1.5)
-    with _per_quantity(ax, quantities, words, keys, (3.75, 1.1 + 0.22 * len(sources))) as (figure, grid):
+    keys, size = _colour_keys(camera, ls="", marker="|", mew=1.5), (3.75, 1.1 + 0.22 * len(sources))
+    with _per_quantity(ax, quantities, words, "Sources of the variance", keys, size) as (figure, grid):
         for axes, quantity in zip(grid, quantities, strict=True):
             for one in (o for o in shares if o.quantity == quantity):
                 position = sources.index(one.source)
@@ -249,7 +251,7 @@ def plot_budget(budget: Budget, ax: "Axes | None" = None) -> "Axes":
     """Draw the yield over the size of some errors, and where it is the wanted one; on `ax` or axes of a new figure."""
     share, low, high = (100 * np.array([getattr(y, side) for y in budget.yields]) for side in ("share", "low", "high"))
     words = f"{budget.yields[0].plates} plates per point, 95 % confidence; {budget}"
-    with single(ax, (5.0, 3.9), note=words) as axes:
+    with single(ax, (5.0, 3.9), f"How large may {budget.what} errors be?", words) as axes:
         axes.fill_between(budget.factors, low, high, **_BAND)
         fine = np.linspace(0, budget.factors[-1], 201)
         axes.plot(fine, 100 * budget.yield_at(fine), color=LINE)
@@ -259,6 +261,6 @@ def plot_budget(budget: Budget, ax: "Axes | None" = None) -> "Axes":
             axes.axvspan(budget.low, budget.high, **_BAD)
             axes.plot(budget.factor, 100 * budget.wanted, "o", color=MARK, ms=6)
         labels = {"xlabel": f"sigma of {budget.what} over that of the process", "ylabel": "yield (%)"}
-        axes.set(xlim=(0, budget.factors[-1]), ylim=(0, 103), title=f"How large may {budget.what} errors be?", **labels)
+        axes.set(xlim=(0, budget.factors[-1]), ylim=(0, 103), **labels)
         axes.grid(True)
     return axes

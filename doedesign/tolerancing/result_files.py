@@ -13,8 +13,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from doedesign.runtime.pool import evaluate_here
 from doedesign.tolerancing.plots import plot_budget, plot_effects, plot_variance_shares, plot_yield
-from doedesign.tolerancing.pool import DrawModel, OutOfModel, evaluate_here, predicted_bank
+from doedesign.tolerancing.pool import DrawModel, OutOfModel, predicted_bank
 from doedesign.tolerancing.studies import FORMAT, Study
 from fab.draws import NOMINAL
 from fab.figure import save
@@ -64,7 +65,8 @@ def _draw(folder: Path, result: "ToleranceResult") -> list[str]:
     # By a worker: it finds there what the others have compiled, and gives the same bytes whatever this process is like.
     model = DrawModel(predicted_bank, design, study.process)
     for key, bank in evaluate_here(model, {key: study.variation(key) for key in shown}, 1):
-        drawn[shown[key]] = plot_psfs(bank, design.camera, design.near_m, design.far_m)
+        whose = f"{design.name}, {'as drawn' if key == NOMINAL else f'worst plate ({key})'}"
+        drawn[shown[key]] = plot_psfs(bank, design.camera, design.near_m, design.far_m, title=whose)
     for name, picture in drawn.items():
         save(picture, folder / name)
     return list(drawn)

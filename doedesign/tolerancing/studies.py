@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 from doedesign import __version__
 from doedesign.build import resolve_process, with_edge_moves
 from doedesign.runs.folder import Run
+from doedesign.runs.journal import Journal
 from doedesign.runs.level_maps import open_design
+from doedesign.runtime.cluster import evaluate_there
+from doedesign.runtime.pool import default_workers, evaluate_here
 from doedesign.runtime.progress import meter
 from doedesign.spec import LimitSpec
 from doedesign.tolerancing.analysis import Sample, limit_from_text, sample_of, yield_of
 from doedesign.tolerancing.budget import FACTORS, Budget, budget_of
-from doedesign.tolerancing.cluster import evaluate_there
-from doedesign.tolerancing.journal import DRAWS_NAME, Journal
-from doedesign.tolerancing.pool import DrawModel, Evaluate, OutOfModel, default_workers, evaluate_here, predicted_rows
+from doedesign.tolerancing.journal import DrawLines
+from doedesign.tolerancing.pool import BYTES_PER_CELL, DrawModel, Evaluate, OutOfModel, predicted_rows
 from doedesign.tolerancing.sensitivity import Effect, VarianceShare, one_at_a_time, sobol
 from fab.draws import (
     EXPECTED,
@@ -101,7 +103,7 @@ class Study:
         except ValueError as error:
             if self.journal.folder is None:
                 raise
-            path = self.journal.folder / DRAWS_NAME
+            path = self.journal.folder / DrawLines.file
             cure = f"Remove {path} to compute all draws again."
             raise InputError(str(path), "all draws must have the same rows", f'"{error}"', cure) from error
 
@@ -242,7 +244,7 @@ def study(
         raise InputError("evaluate", rule, evaluate.__qualname__, "Move it there.")
     given = limits if limits is not None else design.spec.limits if design.spec else ()
     obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in given)
-    journal = Journal(None if out is None else Path(out), _identity(design, made, seed, evaluate))
+    journal = Journal(None if out is None else Path(out), _identity(design, made, seed, evaluate), DrawLines())
     run = _runner(design, workers, scheduler, out is None)
     return Study(design.bare(), made, obeyed, seed, journal, evaluate, run, quiet)
 
@@ -271,7 +273,7 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, in_mem
     cells = design.level_map.level.size
     if workers is not None:
         return partial(evaluate_here, workers=_at_least_one("workers", workers))
-    several = default_workers(cells)
+    several = default_workers(cells * BYTES_PER_CELL)
 
     def run(model: DrawModel, draws: Mapping[str, Variation]) -> Iterator[tuple[str, Any]]:
         return evaluate_here(model, draws, 0 if in_memory and len(draws) * cells < _FEW_CELLS else several)

@@ -34,11 +34,11 @@ from doedesign.runtime.compiling import compiled_step
 from doedesign.runtime.stopping import stoppable
 from doedesign.spec import load_spec
 from doedesign.spec.training import TrainSpec
-from doedesign.training.evaluation import EvaluationResult, HeldOutScene, judge
 from doedesign.training.job import TrainingJob, perceptual_distance, trained_model
 from doedesign.training.joint import rates_at
 from doedesign.training.loss import adam_step, history_line, losses
 from doedesign.training.pairs import PairData, Pairs, crop_shape, cut, find_pairs, pairs_digest, split_pairs
+from doedesign.training.validation import EvaluationResult, HeldOutScene, judge
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_bytes, write_atomic
 from sim.light import srgb_from_linear

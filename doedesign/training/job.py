@@ -16,11 +16,11 @@ end it after the step it is at, with a checkpoint.
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 
@@ -34,15 +34,17 @@ from doedesign.runtime.progress import meter
 from doedesign.runtime.stopping import StopRequest, stoppable
 from doedesign.spec.training import TrainSpec
 from doedesign.training.checkpoint import read_checkpoint, settled, write_checkpoint
-from doedesign.training.evaluation import EvaluationResult
+from doedesign.training.distance.perceptual import Lpips, Perceptual, read_lpips
+from doedesign.training.distance.similarity import MsSsim
 from doedesign.training.history import HISTORY_NAME, open_board, open_history, read_history
 from doedesign.training.hosts import gathered
 from doedesign.training.pairs import PairData
-from doedesign.training.perceptual import Lpips, Perceptual, read_lpips
-from doedesign.training.similarity import MsSsim
+from doedesign.training.validation import EvaluationResult
 from fab.errors import InputError
 from fab.figure import save
 from fab.files import MANIFEST_NAME, canonical_json, read_json, scratch_folder, sha256_bytes, sha256_file, write_atomic
+
+_Opened = TypeVar("_Opened")
 
 _log = logging.getLogger("doedesign")
 
@@ -79,6 +81,10 @@ class TrainingJob(ABC):
     def initial(self) -> Any:
         """The state before the first step."""
 
+    def begun(self, state: Any) -> Any:
+        """The state after what comes before the first step, if anything does; a signal ends that at once."""
+        return state
+
     @abstractmethod
     def step(self, state: Any, batch: Batch) -> tuple[Any, dict[str, Any]]:
         """Take one step; return the new state and the line of the history."""
@@ -97,15 +103,28 @@ class TrainingJob(ABC):
 
 
 def trained_model(job: TrainingJob, out: str | Path | None, *, tensorboard: bool = False) -> Model:
-    """Run a training in a folder, or in a temporary one, which is removed, if it is None; return the model.
+    """Run a training as `trained` does; return the model."""
+    model = trained(job, out, Model.open, tensorboard=tensorboard)
+    return replace(model, folder=None) if out is None else model
+
+
+def trained(
+    job: TrainingJob, out: str | Path | None, opened: Callable[[Path], _Opened], *, tensorboard: bool = False
+) -> _Opened:
+    """Run a training in a folder, or in a temporary one, which is removed, if it is None; return what it left.
 
     A signal ends it after a step, with a checkpoint (KeyboardInterrupt).
+
+    Args:
+        job: the training.
+        out: the folder.
+        opened: reads the results in the folder.
+        tensorboard: write for TensorBoard, too.
     """
     place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else scratch_folder()
     with stoppable() as stop, place as folder:
         _run(job, Path(folder), stop, tensorboard)
-        model = Model.open(folder)
-    return replace(model, folder=None) if out is None else model
+        return opened(Path(folder))
 
 
 def _run(job: TrainingJob, folder: Path, stop: StopRequest, tensorboard: bool) -> None:
@@ -188,6 +207,8 @@ def _take_steps(folder: Path, job: TrainingJob, state: Any, digest: str, stop: S
         _validated(folder, job, state)
     if first == options.steps:
         return state
+    if first == 0:
+        state = job.begun(state)
     with ExitStack() as stack:
         stream = stack.enter_context(job.data.batches(first, options.steps))
         history = stack.enter_context(open_history(folder / HISTORY_NAME, first)) if leads else None

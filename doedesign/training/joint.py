@@ -8,7 +8,7 @@ More than one device: the batch is shared out over a mesh with the one axis "dat
 the same state, and gradients are averaged. With several hosts each hands in its own part of every batch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Key
 from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import sensor_from_spec
-from doedesign.capture.scenes import Batch
+from doedesign.capture.scenes import Batch, NamedScene
 from doedesign.design.levels.quantisation import ROUNDED, Rounding, rounding_at
 from doedesign.design.problem import plans_of
 from doedesign.recon.network import Network, NetworkShape
@@ -33,6 +33,7 @@ from doedesign.spec import Spec
 from doedesign.spec.training import TrainSpec
 from doedesign.spec.values.table import toml_key
 from doedesign.training.hosts import on_all, own_copy, parts_of
+from doedesign.training.lesson import Cells, cells_of, taught
 from doedesign.training.loss import adam_step, history_line, losses
 from doedesign.training.optics import Capture, TrainingDoe, TrainingScene, shots
 from fab.draws import variation_at
@@ -50,19 +51,31 @@ from sim.surface import as_fabricated
 
 AXIS = "data"
 
-_SALT_NOISE, _SALT_FIELD, _SALT_LOOK = 1, 2, 3
+# Of noise when scenes that are held out are looked at, instead of the seed of the training.
+LOOK_SEED = 3
+
+_SALT_NOISE, _SALT_FIELD = 1, 2
 # Depths at which a plate at rest is computed: between two of them its blur disc grows by a few pixels.
 _NEAR_DEPTHS, _FAR_DEPTHS = 24, 3
 
 
 class JointState(NamedTuple):
-    """Everything a step changes: steps done, network, parameters of the DOE (None at rest), and Adam's moments."""
+    """Everything a step changes: steps done, network, parameters of the DOE (None at rest), and Adam's moments.
+
+    With a running mean of the network's weights that, too; it is what the training is for.
+    """
 
     step: int
     network: Network
     free: Array | None
     network_moments: optax.OptState
     optics_moments: optax.OptState | None
+    average: Network | None = None
+
+    @property
+    def best(self) -> Network:
+        """The network to judge and to give away: the mean over steps, or that of the last one."""
+        return self.network if self.average is None else self.average
 
 
 class Rates(NamedTuple):
@@ -135,7 +148,9 @@ class Trainer(eqx.Module):
         if self.doe.parametrization is not None:
             free = jnp.asarray(self.doe.parametrization.radians_of(height_m))
             optics_moments = adam.init(free) if self.spec.train.moves_optics else None
-        state = JointState(0, network, free, moments, optics_moments)
+        # A copy: a step uses the memory of the network again.
+        average = jax.tree.map(jnp.array, network) if self.spec.train.average else None
+        state = JointState(0, network, free, moments, optics_moments, average)
         # Where the step will leave it: otherwise the second step would be compiled anew.
         return state if self.mesh is None else on_all(state, self.mesh)
 
@@ -161,18 +176,43 @@ class Trainer(eqx.Module):
         (network, free), moments, loss, terms = _update()(constants, (learnt, moments))
         cure = "Lower train.learning_rate or train.optics_learning_rate."
         line = history_line("train", state.step, loss, terms, rates._asdict(), cure)
-        return JointState(state.step + 1, network, free, *moments), line
+        average = state.average
+        if average is not None and rates.network > 0:
+            average = _averaged(average, network, jnp.asarray(kept_at(train, state.step), jnp.float32))
+        return JointState(state.step + 1, network, free, *moments, average=average), line
 
     def reconstruct(self, state: JointState, batch: Batch) -> tuple[Capture, Float[Array, "b c y x"]]:
         """Captures of scenes, and their reconstructions in display values, on the axis and without process errors.
 
         One device does it alone.
         """
-        seen, keys = self._seen(batch, _SALT_LOOK, False)
-        network, free, trainer = state.network, state.free, self
+        seen, keys = self._seen(batch, LOOK_SEED, False)
+        network, free, trainer = state.best, state.free, self
         if self.mesh is not None:
             network, free, trainer = own_copy((network, free, trainer))
         return _look(network, free, trainer, seen, keys)
+
+    def taught(
+        self, state: JointState, batches: Iterable[Batch], advance: Callable[[int], None] = lambda done: None
+    ) -> JointState:
+        """The state with a low-resolution branch that has learnt from these scenes (`doedesign.training.lesson`).
+
+        Every host does all of it; `advance` is told how many batches have been looked at.
+        """
+        network, free, trainer = state.network, state.free, self
+        if self.mesh is not None:
+            network, free, trainer = own_copy((network, free, trainer))
+        assert network.light is not None  # the spec's rules see to that
+        scale, seed = network.layout.multiple, self.spec.train.seed
+        found = []
+        for done, batch in enumerate(batches, start=1):
+            found.append(_lesson(free, trainer, *self._seen(batch, seed, False), scale))
+            advance(done)
+        cells = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+        network = eqx.tree_at(lambda n: n.light, network, taught(network.light, cells, seed))
+        average = None if state.average is None else jax.tree.map(jnp.array, network)
+        state = state._replace(network=network, average=average)
+        return state if self.mesh is None else on_all(state, self.mesh)
 
     def _seen(
         self, batch: Batch, seed: int, off_axis: bool, *, shared: bool = False
@@ -182,16 +222,11 @@ class Trainer(eqx.Module):
         count = len(batch.items) // hosts
         # Scenes are numbered across hosts, so that sharing them out differently changes nothing.
         first = (batch.step * hosts + host) * count
-        items = []
-        for k, item in enumerate(batch.items[host * count : (host + 1) * count]):
-            angles = _field_rad(self.spec, seed, first + k) if off_axis else (0.0, 0.0)
-            # In single precision, as the compiled step has them.
-            scene = jax.tree.map(np.float32, self.bench.scene(item.scene))
-            depths = scene.background_depth_m, scene.obstructions[0].depth_m
-            items.append(TrainingScene(scene, *(self.doe.sources(float(depth), angles) for depth in depths)))
-        seen: TrainingScene = jax.tree.map(lambda *leaves: np.stack(leaves), *items)
-        root = jax.random.key(seed + (_SALT_NOISE << 32))
-        return seen, jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.arange(first, first + count))
+
+        def sources(depth_m: float, number: int) -> tuple[Any, ...]:
+            return self.doe.sources(depth_m, _field_rad(self.spec, seed, number) if off_axis else (0.0, 0.0))
+
+        return scenes_seen(self.bench, sources, batch.items[host * count : (host + 1) * count], first, seed)
 
     def _with_errors(self, state: JointState, step: int) -> "Trainer":
         """The same with a plate that has this step's errors, where the process makes any."""
@@ -202,10 +237,37 @@ class Trainer(eqx.Module):
         level = np.asarray(parametrization.level(parametrization.continuous_m(state.free))).astype(np.uint8)
         plate_m = max(camera.grid.extent_m)
         errors = variation_at(self.process, self.spec.train.seed, plate_m, f"normal/{step}")
-        doe = as_fabricated(level, camera, self.process, errors)
+        doe = as_fabricated(level, camera, self.process, errors, whole_cells=True)
         assert isinstance(self.doe.optic, HeightOptic)
         optic = self.doe.optic.made_as(doe, parametrization.drawn_height(level))
         return replace(self, doe=replace(self.doe, optic=optic))
+
+
+def scenes_seen(
+    bench: CaptureModel,
+    sources: Callable[[float, int], tuple[Any, ...]],
+    items: Sequence[NamedScene],
+    first: int,
+    seed: int,
+) -> tuple[TrainingScene, Key[Array, " b"]]:
+    """Scenes for a compiled step, with a noise key for each.
+
+    Args:
+        bench: the camera, which says the colours.
+        sources: describes a point source of the DOE at a depth, metres, for the scene of a number.
+        items: the scenes.
+        first: number of the first of them since the beginning of the training.
+        seed: seed of the noise.
+    """
+    found = []
+    for k, item in enumerate(items):
+        # In single precision, as the compiled step has them.
+        scene = jax.tree.map(np.float32, bench.scene(item.scene))
+        depths = scene.background_depth_m, scene.obstructions[0].depth_m
+        found.append(TrainingScene(scene, *(sources(float(depth), first + k) for depth in depths)))
+    seen: TrainingScene = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+    root = jax.random.key(seed + (_SALT_NOISE << 32))
+    return seen, jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.arange(first, first + len(found)))
 
 
 def layout_of(spec: Spec, colours: int) -> NetworkShape:
@@ -223,6 +285,17 @@ def rates_at(train: TrainSpec, step: int) -> Rates:
     moves_network = train.moves_network and not (turn and optics_turn)
     moves_optics = train.moves_optics and not (turn and not optics_turn)
     return Rates(share * train.learning_rate * moves_network, share * train.optics_learning_rate * moves_optics)
+
+
+def kept_at(train: TrainSpec, step: int) -> float:
+    """Share that the running mean of weights keeps in a step: less at first, so that it forgets how it began."""
+    return min(train.average, (1 + step) / (10 + step))
+
+
+@eqx.filter_jit
+def _averaged(average: Network, network: Network, kept: Array) -> Network:
+    """The running mean of weights after one more step."""
+    return jax.tree.map(lambda old, new: kept * old + (1 - kept) * new, average, network)
 
 
 def devices_mesh(count: int | None = None) -> Mesh | None:
@@ -337,6 +410,19 @@ def _take(constants: _Constants, changing: tuple[_Learnt, tuple[Any, Any]]) -> A
 def _update() -> Callable[[_Constants, tuple[_Learnt, tuple[Any, Any]]], Any]:
     """The compiled step. Made on first use: several hosts have to find each other first."""
     return compiled_step(_take)
+
+
+@eqx.filter_jit
+def _lesson(free: Any, trainer: Trainer, seen: TrainingScene, keys: Array, scale: int) -> Cells:
+    """Cells of a batch, on the axis and without process errors."""
+
+    def of_one(given: tuple[TrainingScene, Array]) -> Cells:
+        one, key = given
+        far, near = (trainer.doe.psf(free, ROUNDED, sources) for sources in (one.far, one.near))
+        found = cells_of(trainer.bench, jax.tree.map(jnp.asarray, one.scene), far, near, key, scale)
+        return jax.tree.map(lambda part: part[0], found)
+
+    return jax.lax.map(of_one, (seen, keys))
 
 
 @eqx.filter_jit

@@ -31,7 +31,7 @@ def losses(
     """The loss, a mean over the batch, and its terms `[l1, perceptual, masked]` before they are weighted.
 
     Display values are not clipped; the mask is the share of each direction that was blocked. The perceptual distance of
-    two batches (`doedesign.training.perceptual`) is left out where its weight in the options is 0.
+    two batches (`doedesign.training.distance.perceptual`) is left out where its weight in the options is 0.
     """
     error = jnp.abs(reconstruction - reference)
     parts = [

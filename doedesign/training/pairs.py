@@ -28,7 +28,7 @@ from jaxtyping import Float
 from doedesign.capture.scenes import Batch, batches_ahead, epoch_order
 from doedesign.recon.model import Model
 from doedesign.recon.photos import PHOTO_FILES, read_capture
-from doedesign.training.evaluation import Split
+from doedesign.training.validation import Split
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, sha256_bytes, sha256_file
 from sim.light import srgb_from_linear

@@ -25,8 +25,8 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float
 
-from doedesign.training.perceptual import Lpips
-from doedesign.training.similarity import WINDOW, Images, ssim_maps
+from doedesign.training.distance.perceptual import Lpips
+from doedesign.training.distance.similarity import WINDOW, Images, ssim_maps
 
 Masks = Float[Array, "b y x"] | Float[np.ndarray, "b y x"]
 Values = Sequence[float] | Float[np.ndarray, "..."]

@@ -2,7 +2,7 @@
 
 A folder of a training (`doedesign.training.job`) has besides
 
-    spec.toml           the spec with every default and override filled in
+    spec.toml           the spec with overrides and defaults; optional keys where they differ
     pictures.json       names of all pictures, trained on and held out, and their licence
     network.npz         the trained network (`doedesign.recon.weights`)
     psf.exr             PSFs of the trained DOE at the depths of the spec and at infinity
@@ -12,11 +12,12 @@ A folder of a training (`doedesign.training.job`) has besides
 """
 
 import logging
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,23 +43,27 @@ from doedesign.recon.model import Model
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
 from doedesign.runs.folder import CONTINUOUS, TRAINING
 from doedesign.runs.level_maps import write_design
+from doedesign.runtime.progress import meter
 from doedesign.runtime.stopping import stoppable
 from doedesign.spec import Spec, spec_digest, spec_from_json, spec_to_json, spec_to_resolved_toml
 from doedesign.spec.training import USUAL_SIZE
-from doedesign.training.evaluation import SCENE_SEED, EvaluationResult, HeldOutScene, Split, judge, split_pictures
+from doedesign.training.distance.perceptual import Lpips, Perceptual
 from doedesign.training.history import require_tensorboard
 from doedesign.training.hosts import join_hosts
 from doedesign.training.job import TrainingJob, perceptual_distance, trained_model
 from doedesign.training.joint import JointState, Trainer, devices_mesh, layout_of, resting_doe
+from doedesign.training.validation import SCENE_SEED, EvaluationResult, HeldOutScene, Split, judge, split_pictures
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_bytes, sha256_file, write_atomic
 from fab.level_map import LevelMap
+from sim.imaging.occlusion import Model as OcclusionModel
 from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
 from sim.psf_bank import psf
 from sim.store import write_bank
 
 _MOST_THREADS = 8
+_LESSON = 1  # apart from the scenes of the steps
 _log = logging.getLogger("doedesign")
 
 
@@ -113,37 +118,17 @@ def train(
         raise InputError("devices", rule, devices, "Leave it out.")
     join_hosts(coordinator, hosts, host)
     with stoppable():  # which ends the preparation, too
-        design, spec = _with_options(design, options)
-        source, how = str((design.folder or Path()) / "spec.toml"), spec.train
-        model = occlusion_from_spec(spec, source, occlusion)
-        kind = obstruction_from_spec(spec, source, obstruction)
-        lpips, perceptual = perceptual_distance(how, how.size, f"{source}: train.size", lpips_weights)
-        _require_possible(spec, source)
-        given, own = (None if folder is None else Path(folder) for folder in (images, validation))
-        split = split_pictures(given, own, how.validation, how.seed)
-        data, held_out = _scenes(spec, kind, split)
+        made = prepared(design, images, validation, occlusion, obstruction, lpips_weights, licence, options)
+        design, spec, source, model, kind = made.design, made.spec, made.source, made.occlusion, made.kind
+        how, perceptual = spec.train, made.perceptual
         _log.info("preparing propagation")
         at_rest, mesh = design.nominal_height_m, devices_mesh(devices)
         trainer = Trainer.of(spec, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
         settings = {
             "format": TRAINING,
-            "run": spec.name,
-            "spec_sha256": spec_digest(spec),
             "height_sha256": _height_digest(design),
-            "occlusion": model,
-            "obstruction": getattr(kind, "name", type(kind).__name__),
-            "obstruction_parameters": plain_parameters(kind),
             "camera": how.camera,
-            "pictures_sha256": data.pictures.digest(),
-            "held_out_sha256": held_out.pictures.digest(),
-            "perceptual": "none" if perceptual is None else perceptual.name,
-            "perceptual_sha256": "" if perceptual is None else perceptual.digest,
-            "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
-        }
-        pictures = {
-            "licence": licence,
-            "training": [_name(path, given) for path in split.training],
-            "held_out": [_name(path, own or given) for path in split.held_out],
+            **made.settings,
         }
         resolved = spec_to_resolved_toml(spec, overrides).encode()
         job = JointTraining(
@@ -152,17 +137,87 @@ def train(
             options=how,
             settings=settings,
             remarks={"licence": licence},
-            inputs={"spec.toml": resolved, "pictures.json": canonical_json(pictures)},
+            inputs={"spec.toml": resolved, "pictures.json": canonical_json(made.pictures)},
             differs="one with another run, spec, occlusion model, perceptual loss or other pictures",
             design=design,
             trainer=trainer,
             kind=kind,
-            data=data,
-            held_out=held_out,
-            lpips=lpips,
-            pictures=pictures,
+            data=made.data,
+            held_out=made.held_out,
+            lpips=made.lpips,
+            pictures=made.pictures,
         )
     return trained_model(job, out, tensorboard=tensorboard)
+
+
+class Prepared(NamedTuple):
+    """The common part of trainings behind a design, whatever the network.
+
+    Attributes:
+        design: the design, whose spec has the options of the training.
+        spec: that spec.
+        source: name of its file for messages.
+        occlusion: occlusion model.
+        kind: the obstruction.
+        data: scenes to train on.
+        held_out: scenes to judge by.
+        lpips: weights of LPIPS, if at hand.
+        perceptual: the distance of the loss, if it has one.
+        settings: what the result depends on, as far as it is said here.
+        pictures: names and licence of the pictures for the record.
+    """
+
+    design: Design
+    spec: Spec
+    source: str
+    occlusion: OcclusionModel
+    kind: ObstructionKind
+    data: SceneData
+    held_out: SceneData
+    lpips: Lpips | None
+    perceptual: Perceptual | None
+    settings: dict[str, Any]
+    pictures: dict[str, Any]
+
+
+def prepared(
+    design: Design,
+    images: str | Path | None,
+    validation: str | Path | None,
+    occlusion: str | None,
+    obstruction: str | None,
+    lpips_weights: Sequence[Path],
+    licence: str | None,
+    options: Mapping[str, Any],
+) -> Prepared:
+    """Prepare a training behind a design; arguments and errors are those of `train`."""
+    design, spec = _with_options(design, options)
+    source, how = str((design.folder or Path()) / "spec.toml"), spec.train
+    model = occlusion_from_spec(spec, source, occlusion)
+    kind = obstruction_from_spec(spec, source, obstruction)
+    lpips, perceptual = perceptual_distance(how, how.size, f"{source}: train.size", lpips_weights)
+    _require_possible(spec, source)
+    given, own = (None if folder is None else Path(folder) for folder in (images, validation))
+    split = split_pictures(given, own, how.validation, how.seed)
+    data, held_out = _scenes(spec, kind, split)
+    settings = {
+        "run": spec.name,
+        "spec_sha256": spec_digest(spec),
+        "occlusion": model,
+        "obstruction": getattr(kind, "name", type(kind).__name__),
+        "obstruction_parameters": plain_parameters(kind),
+        "pictures_sha256": data.pictures.digest(),
+        "held_out_sha256": held_out.pictures.digest(),
+        "perceptual": "none" if perceptual is None else perceptual.name,
+        "perceptual_sha256": "" if perceptual is None else perceptual.digest,
+        "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
+    }
+    pictures = {
+        "licence": licence,
+        "training": [_name(path, given) for path in split.training],
+        "held_out": [_name(path, own or given) for path in split.held_out],
+    }
+    return Prepared(design, spec, source, model, kind, data, held_out, lpips, perceptual, settings, pictures)
 
 
 def _with_options(design: Design, options: Mapping[str, Any]) -> tuple[Design, Spec]:
@@ -173,12 +228,22 @@ def _with_options(design: Design, options: Mapping[str, Any]) -> tuple[Design, S
     if options:
         tables = spec_to_json(spec)
         spec = spec_from_json({**tables, "train": {**tables.get("train", {}), **options}}, "train")
+    size = training_size(spec)
+    if size != spec.train.size:
+        _log.info("training pictures of %d pixels per side, what the sensor has", size)
+        spec = spec.model_copy(update={"train": spec.train.model_copy(update={"size": size})})
+    return replace(design, spec=spec), spec
+
+
+def training_size(spec: Spec) -> int:
+    """Pixels per side of a spec's training pictures: on a sensor with fewer than the usual ones, what it has.
+
+    Raises:
+        InputError: a spec without a sensor, or one that does not say how many photosites it has.
+    """
     coarsest = 2**spec.network.depth
     fitting = sensor_side(spec) // coarsest * coarsest
-    if spec.train.size == USUAL_SIZE > fitting >= 2 * coarsest:
-        _log.info("training pictures of %d pixels per side, what the sensor has", fitting)
-        spec = spec.model_copy(update={"train": spec.train.model_copy(update={"size": fitting})})
-    return replace(design, spec=spec), spec
+    return fitting if spec.train.size == USUAL_SIZE > fitting >= 2 * coarsest else spec.train.size
 
 
 def _scenes(spec: Spec, kind: ObstructionKind, split: Split) -> tuple[SceneData, SceneData]:
@@ -186,9 +251,11 @@ def _scenes(spec: Spec, kind: ObstructionKind, split: Split) -> tuple[SceneData,
     camera, how = camera_from_spec(spec), spec.train
     view = CameraView((how.size, how.size), camera.pixel_m, camera.sensor_distance_m)
     far = (min(spec.scene.far_m), max(spec.scene.far_m))
-    trained_on, judged_by = (Pictures(files, most_px=2 * how.size) for files in split[:2])
+    # A window of the least share of a picture shall have the pixels of a crop.
+    most_px = 2 * how.size if how.zoom is None else math.ceil(how.size / how.zoom[0])
+    trained_on, judged_by = Pictures(split.training, most_px), Pictures(split.held_out, 2 * how.size)
     threads = min(_MOST_THREADS, max(2, os.cpu_count() or 1))
-    data = SceneData(trained_on, kind, view, far, how.seed, how.batch, threads)
+    data = SceneData(trained_on, kind, view, far, how.seed, how.batch, threads, zoom=how.zoom)
     return data, SceneData(judged_by, kind, view, far, SCENE_SEED, mirrored=False)
 
 
@@ -213,6 +280,8 @@ class JointTraining(TrainingJob):
         if self.options.camera == "conventional":
             shape = self.trainer.bench.camera.grid.shape if learnt is None else learnt.shape
             return self.trainer.initial(np.zeros(shape, np.float32))
+        if heights is None and self.trainer.doe.parametrization is None:
+            heights = self.design.nominal_height_m  # it stays at rest, whatever it was before rounding
         if heights is None:
             rule, cure = "must have its heights before rounding", "Give one that was optimised, or the run of one."
             raise InputError("design", rule, "level numbers alone", cure)
@@ -220,6 +289,14 @@ class JointTraining(TrainingJob):
             heights = learnt.heights_of(heights)
             assert heights is not None  # `optimize` writes a raster of rings for a radial design
         return self.trainer.initial(heights)
+
+    def begun(self, state: JointState) -> JointState:
+        """Teach the low-resolution branch by itself, if that is asked for."""
+        if not (count := self.options.light_scenes):
+            return state
+        scenes, batches = replace(self.data, seed=self.options.seed + (_LESSON << 32)), -(-count // self.data.batch)
+        with scenes.batches(stop=batches) as stream, meter("scenes for veil and gain", batches) as progress:
+            return self.trainer.taught(state, stream, progress.advance)
 
     def step(self, state: JointState, batch: Batch) -> tuple[JointState, dict[str, Any]]:
         """Take one step."""
@@ -269,7 +346,7 @@ class JointTraining(TrainingJob):
         found = self.evaluate(state, baselines=True)
         write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))
         about = {**self.settings, "steps": state.step, "pictures": self.pictures, "version": __version__}
-        write_network(folder / NETWORK_NAME, state.network, {**camera_facts(camera, near), **about})
+        write_network(folder / NETWORK_NAME, state.best, {**camera_facts(camera, near), **about})
         for data in (self.data, self.held_out):
             if skips := data.pictures.skips():
                 _log.info("%s", skips)
@@ -305,10 +382,10 @@ def _shown(trainer: Trainer, state: JointState, batch: Batch, baselines: bool) -
 
 def _height_digest(design: Design) -> str:
     """SHA-256 of the heights to begin with: of their file where there is one."""
-    if design.folder is not None:
+    if design.folder is not None and (design.folder / CONTINUOUS).is_file():
         return sha256_file(design.folder / CONTINUOUS)
-    assert design.continuous_m is not None  # that of an optimised design
-    return sha256_bytes(design.continuous_m.tobytes())
+    heights = design.nominal_height_m if design.continuous_m is None else design.continuous_m
+    return sha256_bytes(heights.tobytes())
 
 
 def _name(path: Path, folder: Path | None) -> str:

@@ -96,7 +96,11 @@ class Aperture(ABC):
 
 @dataclass(frozen=True)
 class RoundAperture(Aperture):
-    """A disc of a diameter in metres; an infinite one is all of a raster, as of a piece that was cut out of a DOE."""
+    """A disc.
+
+    Attributes:
+        diameter_m: diameter, metres; an infinite one is all of a raster, as of a piece that was cut out of a DOE.
+    """
 
     diameter_m: float
 

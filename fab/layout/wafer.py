@@ -34,7 +34,7 @@ class Wafer:
         chrome: how the aperture's chrome is made.
         compensate: whether masks are drawn with their edges moved against the line-width bias that the process is
             known for (`Process.expected`).
-        edge_moves_m: how far masks are drawn with the edges of etched areas moved outward instead, mask 0 first,
+        edge_moves_m: how far masks are drawn with the edges of etched areas moved outward instead, first mask first,
             metres.
         line_splits_m: for each entry some dies whose edges of etched areas are drawn so much further out, metres.
         order_control: whether some dies draw the planes in the opposite order of depths (`fab.layout.split`).

@@ -135,7 +135,14 @@ def _require_own(folder: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class WrittenOrder:
-    """A mask order in a folder: what was drawn, what every file is, and the read-back, every check passed."""
+    """A mask order in a folder.
+
+    Attributes:
+        folder: the folder.
+        order: the drawing.
+        manifest: what every file is.
+        report: the read-back, of which every check passed.
+    """
 
     folder: Path
     order: Order

@@ -37,7 +37,7 @@ def plot_height(
     heights = height.height_m[inside]
     ends = _range_m(heights, levels)
     style = {"cmap": colormaps[HEIGHTS].with_extremes(bad=CHROME), "vmin": ends[0] / NM, "vmax": ends[1] / NM}
-    with panels(ax, (10.1, 5.35), title) as figure:
+    with panels(ax, (10.1, 5.35), f"{title}: height map" if title else "Height map") as figure:
         at = figure.subplot_mosaic(
             [["whole", "centre", "scale", "shares"], ["whole", "edge", "scale", "shares"]],
             width_ratios=(4.2, 1.95, 0.16, 1.75),

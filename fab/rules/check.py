@@ -176,7 +176,14 @@ class OffGrid:
 
 @dataclass(frozen=True, eq=False)
 class RulesReport:
-    """Rules checked on every etch mask of a level map, mask 0 first, and on its raster; lengths in metres."""
+    """Rules checked on every etch mask of a level map and on its raster; lengths in metres.
+
+    Attributes:
+        level_map: the level map.
+        rules: the rules of the process.
+        planes: what every mask breaks, first mask first.
+        off_grid: what lies off the grid of the mask writer.
+    """
 
     level_map: LevelMap
     rules: Rules

@@ -68,7 +68,13 @@ class RepairCost:
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A repaired level map: the map, the cost of its repair, and the rules checked on it."""
+    """A repaired level map.
+
+    Attributes:
+        level_map: the level map.
+        cost: extent and cost of the repair.
+        rules: the rules, checked on it.
+    """
 
     level_map: LevelMap
     cost: RepairCost

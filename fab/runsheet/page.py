@@ -6,18 +6,26 @@ from typing import Any
 
 from fab.units import format_length
 
+_TEMPLATES = Path(__file__).parent / "templates"
 
-def html_page(template: str, **values: Any) -> bytes:
-    """Fill a template of this package; what it asks for and does not get is an error, no blank."""
-    return _templates().get_template(template).render(**values).encode()
+
+def html_page(template: str, *, folder: Path = _TEMPLATES, **values: Any) -> bytes:
+    """Fill a template with values; what it asks for and does not get is an error, no blank.
+
+    Args:
+        template: its file.
+        folder: its folder; that of this package by default.
+        values: what it asks for.
+    """
+    return _templates(folder).get_template(template).render(**values).encode()
 
 
 @cache
-def _templates() -> Any:
+def _templates(folder: Path) -> Any:
     import jinja2
 
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -22,7 +22,12 @@ class Check:
 
 @dataclass(frozen=True)
 class VerificationReport:
-    """All checks of a mask order, in the order they were made, and a sentence on everything that was not compared."""
+    """Verification of a mask order.
+
+    Attributes:
+        checks: all checks, in the order they were made.
+        notes: a sentence on everything that was not compared.
+    """
 
     checks: tuple[Check, ...]
     notes: tuple[str, ...] = ()

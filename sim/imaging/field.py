@@ -106,6 +106,9 @@ def capture_frame(
 
     Returns:
         `[c, y, x]` light, no noise.
+
+    Raises:
+        ValueError: an unknown model or border, or a scene of other colours or depths than the optics.
     """
     check_names(model, outside)
     check_layers(scene, *optics.psf.shape[2:4])

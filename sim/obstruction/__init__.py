@@ -6,6 +6,7 @@
     fence       chain-link, bars and grids of round wire
     raindrop    drops of water that refract the scene; dirt or drops by the toss of a coin
     dirt        clumps of soil
+    mixed       one of these three, by lot
     release     the three with the numbers of the paper's public code
     folder      masks out of a user's folder
 
@@ -20,6 +21,7 @@ from types import MappingProxyType
 from sim.obstruction.dirt import Dirt
 from sim.obstruction.fence import Fence
 from sim.obstruction.folder import MaskFolder
+from sim.obstruction.mixed import DirtRaindropFence
 from sim.obstruction.parameters import ObstructionKind
 from sim.obstruction.raindrop import DirtRaindrop, Raindrop
 from sim.obstruction.release import ReleaseDirt, ReleaseFence, ReleaseRaindrop
@@ -30,6 +32,7 @@ __all__ = [
     "CameraView",
     "Dirt",
     "DirtRaindrop",
+    "DirtRaindropFence",
     "Fence",
     "MaskFolder",
     "ObstructionKind",
@@ -43,6 +46,9 @@ __all__ = [
 OBSTRUCTIONS: Mapping[str, type[ObstructionKind]] = MappingProxyType(
     {
         kind.name: kind
-        for kind in (Fence, Raindrop, Dirt, DirtRaindrop, ReleaseFence, ReleaseRaindrop, ReleaseDirt, MaskFolder)
+        for kind in (
+            *(Fence, Raindrop, Dirt, DirtRaindrop, DirtRaindropFence),
+            *(ReleaseFence, ReleaseRaindrop, ReleaseDirt, MaskFolder),
+        )
     }
 )

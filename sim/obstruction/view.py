@@ -9,7 +9,13 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class CameraView:
-    """A frame of (y, x) pixels behind a lens, in perspective through the middle of the aperture; lengths in metres."""
+    """A frame of pixels behind a lens, in perspective through the middle of the aperture.
+
+    Attributes:
+        shape: pixels (y, x).
+        pixel_m: distance of the pixels, metres.
+        focal_m: distance of the sensor behind the lens, metres.
+    """
 
     shape: tuple[int, int]
     pixel_m: float

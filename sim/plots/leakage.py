@@ -42,10 +42,10 @@ def plot_split(
     note = (
         f"Source at {length_text(nominal.depths_m[depth])}. Leaked: what the mean of the plate's transmission, its 0th "
         "order, images as if the plate were flat. Diffracted: the rest. In each pixel the two also interfere, so the "
-        "pictures do not simply add."
+        "pictures do not simply add. Colours are logarithmic, one scale for all."
     )
     size = (4 * (_SIDE + 0.1) + 0.4, len(colours) * (_SIDE + 0.1) + 1.3)
-    with panels(ax, size, note=note, layout="compressed") as figure:
+    with panels(ax, (size[0], size[1] + 0.35), "Leaked and diffracted light", note, layout="compressed") as figure:
         panes = figure.subplots(len(colours), 4, squeeze=False)
         for row, c in zip(panes, colours, strict=True):
             split = splits[c, depth]

@@ -43,7 +43,8 @@ def plot_pattern(
         f"target {title}".strip(),
         f"achieved: efficiency {100 * efficiency:.1f} %, uniformity {100 * uniformity:.1f} %",
     )
-    with panels(ax, (8.3, 3.95), layout="compressed") as figure:
+    note = "one scale for both, the square root of the light, so that ghosts of one per cent show"
+    with panels(ax, (8.3, 4.5), "Target and achieved light", note, layout="compressed") as figure:
         panes = figure.subplots(1, 2, sharex=True, sharey=True)
         norm, box = PowerNorm(0.5, 0.0, top, clip=True), extent_of(target.shape, camera.pixel_m, unit_of(camera).scale)
         for axes, image, title in zip(panes, images, titles, strict=True):

@@ -82,9 +82,9 @@ def compare_row(
     """Orders of a row of glass cells in air that repeats, lit from the air at normal incidence.
 
     Args:
-        height_m: height of every cell.
-        cell_m: width of a cell.
-        wavelength_m: vacuum wavelength.
+        height_m: `[cell]` height of every cell, metres.
+        cell_m: width of a cell, metres.
+        wavelength_m: vacuum wavelength, metres.
         index: refractive index of the glass.
         waves: orders of the rigorous solution over those that travel in the glass.
 

@@ -197,7 +197,7 @@ def developed(
     """Light relative to white that raw numbers stand for: black level and dark current off, colours balanced.
 
     Args:
-        raw: numbers of `expose`, or of `demosaiced` for a sensor with a mosaic.
+        raw: `[..., c, y, x]` numbers of `expose`, or of `demosaiced` for a sensor with a mosaic.
         sensor: the sensor.
 
     Returns:

@@ -46,9 +46,10 @@ class FabricatedDoe(ViewedOptic):
             on a near and on a far source's way takes too wide a band.
         means: `[wavelength, y, x]` mean transmission of every cell without the chrome, for overlaps with other DOEs; 0
             far under it.
-        wavelengths_m: vacuum wavelengths.
-        height_m: `[y, x]` height of every cell of a DOE exactly as drawn, whose PSFs are those of its height map, bit
-            for bit; otherwise None.
+        wavelengths_m: vacuum wavelengths, metres.
+        height_m: `[y, x]` height, metres, of every cell of a DOE exactly as drawn, whose PSFs are those of its height
+            map, bit for bit; otherwise None.
+        source_kind: how sources are described.
     """
 
     camera: Camera = eqx.field(static=True)
@@ -83,6 +84,7 @@ def as_fabricated(
     wavelengths_m: tuple[float, ...] | None = None,
     *,
     depths_m: Sequence[float] = (np.inf,),
+    whole_cells: bool = False,
 ) -> FabricatedDoe:
     """Predict the plate that the masks of a level map and a process with given errors make.
 
@@ -95,6 +97,8 @@ def as_fabricated(
         depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between. They say
             how obliquely cells are lit, which matters where edges moved within them. From other depths the plate looks
             as from the nearest of these; random plates with 0.5 um of overlay are then off by up to 7 %.
+        whole_cells: keep the camera's grid, for optimisers that need one for all plates. Where edges moved and the
+            sensor sees light too oblique for moments of whole cells, its border is then less exact.
 
     Returns:
         the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.
@@ -118,7 +122,7 @@ def as_fabricated(
         return FabricatedDoe(camera, coverage, coverage * flat, views, flat, lines, height)
     if not traced:
         require_possible(camera.grid, process, variation)
-    plan, views = plan_of(camera, process, variation, lines, (min(depths_m), max(depths_m)), traced)
+    plan, views = plan_of(camera, process, variation, lines, (min(depths_m), max(depths_m)), traced, whole_cells)
     etched = planes(level_map, levels)
     for particle in variation.particles:
         _keep_off(etched, particle, camera.grid)

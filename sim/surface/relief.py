@@ -83,6 +83,7 @@ def plan_of(
     wavelengths_m: tuple[float, ...],
     depths_m: tuple[float, float],
     traced: bool,
+    whole_cells: bool = False,
 ) -> tuple[TilePlan, tuple[View, ...]]:
     """Plan the terms that these errors need, all of them where the errors are not known yet (`traced`), and the views.
 
@@ -108,7 +109,7 @@ def plan_of(
     widest = max(2 * waves.seen / _WIDEST_SEEN for waves in oblique)
     highest = max((waves.seen + max(-waves.low, waves.high, 0)) / _HIGHEST for waves in oblique)
     # Light so oblique that halves of cells do not do is next to none: their sinc has fallen to a tenth.
-    parts = max(1, int(np.ceil(max(widest, min(highest, 2.0)) - 1e-9)))
+    parts = 1 if whole_cells else max(1, int(np.ceil(max(widest, min(highest, 2.0)) - 1e-9)))
     # Plates whose edges did not move have the same views, so that all share their compiled programs.
     views = tuple(
         view

@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from doedesign.runs.folder import COST_NAME
 from tests.campaign.shim import Fault, shimmed
 
 ROOT = Path(__file__).parents[2]
@@ -231,9 +232,11 @@ def _resident() -> int:
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """Every file and folder below a folder by its relative name, the times that training steps took left out."""
+    """Every file and folder below a folder by its relative name, the times that steps and commands took left out."""
     found: dict[str, bytes] = {}
     for path in sorted(folder.rglob("*")):
+        if path.name == COST_NAME:
+            continue
         name = str(path.relative_to(folder))
         if path.is_symlink():
             found[name] = b"link " + os.fsencode(os.readlink(path))

@@ -32,6 +32,7 @@ def test_nothing_is_lost_and_nothing_crashes(campaign: Campaign, family: str):
     assert not [result for result in found if result.problems], table(found)
 
 
+@pytest.mark.slow
 def test_changed_specs_in_a_warm_process(tmp_path: Path):
     """Whatever was changed, one message says what is wrong; the override is refused where nothing else is."""
     spec, rng = tmp_path / "work" / "spec.toml", np.random.default_rng(SEED)

@@ -1,5 +1,7 @@
 """Classic designs by name, each against what its formula promises in the light of a lens."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -79,6 +81,32 @@ def test_a_cubic_phase_hardly_changes_out_of_focus():
     assert alike[1] < 0.9
 
 
+def test_a_quartic_keeps_its_peak_over_as_many_waves_as_it_has():
+    """Light on the axis over that of a lens in focus, for W waves of defocus: |∫ exp 2πi (w (t² - t) + W t) dt|².
+
+    It is about 1 / (2 w) from -w to w, and gone beyond, where no zone is in focus any more.
+    """
+    waves, share = 5.0, (np.arange(4000) + 0.5) / 4000
+    fine = replace(CAMERA, pixel_m=0.2e-6, window=1)  # an Airy disc is 3.4 um wide
+    setup = StartSetup(fine, False, GREEN)
+    ideal = float(psf(HeightOptic.of(fine)).energy[0, 0, 0, 0])
+    optic, peaks = HeightOptic.of(fine, start_heights("quartic", {"waves": waves}, setup)), {}
+    for defocus in (0.0, 3.0, -3.0, 9.0, -9.0):
+        # D² / 8 of curvature; a sensor before the focus takes curvature away.
+        curvature = 8 * GREEN * defocus / fine.aperture_m**2
+        moved = -curvature * fine.focal_length_m**2 / (1 + curvature * fine.focal_length_m)
+        own = optic.with_camera(replace(fine, defocus_m=moved))
+        phase = waves * (share**2 - share) + defocus * share
+        closed = np.abs(np.mean(np.exp(2j * np.pi * phase))) ** 2
+        # A cell's height is that of its middle, at most a tenth of a wave off.
+        # A nearer sensor has a smaller picture.
+        nearer = (1 + moved / fine.focal_length_m) ** 2
+        peaks[defocus] = float(psf(own).energy[0, 0, 0, 0]) * nearer / ideal
+        assert peaks[defocus] == pytest.approx(closed, abs=0.01)
+    assert min(peaks[0.0], peaks[3.0], peaks[-3.0]) > 0.6 / (2 * waves)
+    assert max(peaks[9.0], peaks[-9.0]) < 0.2 / (2 * waves)
+
+
 @pytest.mark.parametrize("formula", [axilens, logarithmic_asphere])
 def test_zones_of_an_extended_focus_point_to_their_distance(formula: object):
     radius = np.linspace(1e-6, 1e-3, 2001)
@@ -102,6 +130,7 @@ def test_zones_of_an_extended_focus_point_to_their_distance(formula: object):
         ("lens_array", {"pitch": "20 um"}, "needs it"),
         ("axilens", {"near": "5 mm", "far": "5 mm"}, "must differ"),
         ("cubic", {"wave": 3}, "options of start"),
+        ("quartic", {"waves": "5"}, "a number from"),
     ],
 )
 def test_bad_options_are_refused(name: str, options: dict[str, object], words: str):

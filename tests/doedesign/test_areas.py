@@ -108,6 +108,7 @@ def test_transport_is_a_lens_where_both_pictures_are_alike():
     np.testing.assert_allclose(y[inside] / (2 * np.pi), (at[:, None] / 4 + 0.3 + 0 * at)[inside], atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", ["", 'kind = "gaussian"\ndiameter = ["300 um", "250 um"]\nm_squared = 1.3'])
 def test_light_on_the_lattice_is_that_of_the_sensor(tmp_path: Path, beam: str):
     """Against `sim.psf`, whose transform is another: summed over the area, and its share of the window."""
@@ -137,6 +138,7 @@ def field_at(design: Design, y_m: np.ndarray, x_m: np.ndarray) -> np.ndarray:
     return rows @ behind @ columns.T
 
 
+@pytest.mark.slow
 def test_an_area_has_a_flat_phase_if_that_is_asked_for(tmp_path: Path):
     """Away from its edges all of it is one wave; where the phase is free, it is bent by turns."""
     spread, y, x = {}, np.linspace(-60e-6, 60e-6, 31), np.linspace(-110e-6, 110e-6, 41)
@@ -170,6 +172,7 @@ def test_an_area_has_a_flat_phase_if_that_is_asked_for(tmp_path: Path):
     assert "in the wave that is given" in flat.describe()
 
 
+@pytest.mark.slow
 def test_a_frame_around_a_wave_is_dark_if_that_is_asked_for(tmp_path: Path):
     spec = spec_of(tmp_path, "optimize.steps=120", "area.phase=flat", "area.dark=60 um")
     design = optimize(spec)
@@ -180,6 +183,7 @@ def test_a_frame_around_a_wave_is_dark_if_that_is_asked_for(tmp_path: Path):
     assert table.light[~(table.target.dark | table.target.lit)].max() > 5  # what is left is right beyond the frame
 
 
+@pytest.mark.slow
 def test_a_ring_has_the_vortex_of_a_picture(tmp_path: Path):
     """A picture whose grey turns once around the middle: so does the phase of the light."""
     at = np.arange(64) - 31.5
@@ -214,6 +218,7 @@ def test_the_problem_sees_the_light_of_the_optic(tmp_path: Path):
     np.testing.assert_allclose(seen, light_on(design.as_optic(), task.targets[0]), atol=1e-4 * seen.max())
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_loss(tmp_path: Path):
     task = AreaTask.from_spec(spec_of(tmp_path))
     rng = np.random.default_rng(1)
@@ -244,6 +249,7 @@ def test_a_rectangle_has_its_size_and_is_even(tmp_path: Path):
     assert areas_of_design(brighter, brighter.as_optic())[0].efficiency > table.efficiency + 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "least", "wide"),
     [
@@ -267,6 +273,7 @@ def test_other_shapes_get_most_of_the_light(tmp_path: Path, changes: list[str], 
     assert table.along_x.size_m == pytest.approx(300e-6, rel=wide)
 
 
+@pytest.mark.slow
 def test_a_picture_is_drawn_upright(tmp_path: Path):
     grey = np.zeros((40, 60), np.uint8)
     grey[25:35, 10:50] = 255  # a bar in the upper half
@@ -288,6 +295,7 @@ def test_a_picture_is_drawn_upright(tmp_path: Path):
     assert area_table(design.as_optic(), table.target).summary() == table.summary()
 
 
+@pytest.mark.slow
 def test_a_run_of_a_picture_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A portrait, all of it; the run keeps it, and takes no picture of that name for its own before it is one."""
     leave_out_pictures(monkeypatch, optimization)
@@ -348,6 +356,7 @@ def test_power_is_that_of_the_beam(tmp_path: Path):
     assert np.sum(np.abs(waves) ** 2) == pytest.approx(1 - np.exp(-2 * (camera.aperture_m / 200e-6) ** 2), abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [pytest.param(10, marks=pytest.mark.slow), 40])
 def test_a_stopped_run_goes_on_to_the_same_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int):
     leave_out_pictures(monkeypatch, optimization)
@@ -412,6 +421,7 @@ LEFT, RIGHT = 'offset = ["-150 um", "0 um"]', 'offset = ["150 um", "0 um"]'
 TWO_COLOURS = ("optics.wavelengths=['638 nm', '450 nm']", "process.levels=32", "process.level_step='90 nm'")
 
 
+@pytest.mark.slow
 def test_every_colour_lights_an_area_of_its_own(tmp_path: Path):
     """A relief of two to three waves sends red to the left and blue to the right: by PSFs, and by tables."""
     spec = several(tmp_path, [f'{LEFT}\ncolour = "638nm"', f'{RIGHT}\ncolour = "450nm"'], *TWO_COLOURS)
@@ -433,6 +443,7 @@ def test_every_colour_lights_an_area_of_its_own(tmp_path: Path):
     assert found["contrast"] == pytest.approx(max(table.contrast for table in tables), abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_loss_of_several_areas_is_near_to_the_worst_and_its_gradient_right(tmp_path: Path):
     task = AreaTask.from_spec(
         several(tmp_path, [f'{LEFT}\ncolour = "638nm"', f'{RIGHT}\ncolour = "450nm"'], *TWO_COLOURS)
@@ -451,6 +462,7 @@ def test_the_loss_of_several_areas_is_near_to_the_worst_and_its_gradient_right(t
     assert slope == pytest.approx((ends[0] - ends[1]) / 0.04, rel=0.03)  # single precision
 
 
+@pytest.mark.slow
 def test_areas_in_two_planes(tmp_path: Path):
     """Without a lens, light is wide at 30 mm and tall at 60 mm: by PSFs of sensors there."""
     sizes = {30e-3: (110e-6, 250e-6), 60e-3: (400e-6, 200e-6)}

@@ -81,6 +81,7 @@ def require_within_limits(errors: Mapping[str, tuple[float, float]]) -> None:
         assert abs(error) < LIMITS.get(name.partition("[")[0], np.inf), name
 
 
+@pytest.mark.slow
 def test_the_models_camera_stands_as_the_benchs():
     """A plate as drawn, with a hard rim there and one of grey cells here."""
     design, process = plate(64, 4)

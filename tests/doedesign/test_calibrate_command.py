@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from doedesign.build import process_from_spec
+from doedesign.reference.other_numbers import OTHER_GROUPS
 from doedesign.runs.folder import open_run
 from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_process, load_variation
@@ -94,10 +95,14 @@ def test_the_files_say_what_was_found(run: Path, fitted: tuple[int, str, str]):
         "small.toml"
     }
     assert [image["name"] for image in record["images"]] == ["near0", "far1"]
-    assert "overlay x, mask 1" in said
+    assert "overlay x, mask 2" in said
     manifest = json.loads((folder / "manifest.json").read_text())
     for name, digest in manifest["results_sha256"].items():
         assert sha256_file(folder / name) == digest
+    tables = {name: record.pop(name) for name in ("errors", "camera", "images", "readings")}
+    names = {*record, *(name for rows in tables.values() for row in rows for name in row)}
+    defined = next(group.numbers for group in OTHER_GROUPS if group.title == "Calibrations")
+    assert names - {"run", "measurement_sha256"} == set(defined)
 
 
 @pytest.mark.slow
@@ -131,6 +136,7 @@ def test_the_same_measurement_gives_the_same_bytes(run: Path, fitted: tuple[int,
             assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
 
 
+@pytest.mark.slow
 def test_two_numbers_give_a_family(run: Path):
     numbers = ("--ring-to-disc", 2.0, "--throughput", 0.5, "--probe", "520 nm", "--depth", "3 mm")
     code, out, said = call("calibrate", run, *numbers, "--errors", "overlay_x", "--errors", "depth", "--reach", 2)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from doedesign.build import camera_from_spec
+from doedesign.capture.camera import depth_range_m
 from doedesign.capture.from_spec import (
     channels_from_rgb,
     obstruction_from_spec,
@@ -19,7 +20,7 @@ from doedesign.spec import load_spec, scene, spec_digest, spec_from_json, spec_t
 from fab.errors import InputError
 from fab.files import canonical_json
 from sim.imaging.occlusion import Model
-from sim.obstruction import OBSTRUCTIONS, Dirt, DirtRaindrop, Fence, MaskFolder
+from sim.obstruction import OBSTRUCTIONS, Dirt, DirtRaindrop, DirtRaindropFence, Fence, MaskFolder
 from sim.sensor import NoiseModel, Pattern, Sensor
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -122,6 +123,21 @@ def test_the_obstruction_stands_where_the_plate_was_made_for():
     assert obstruction_from_spec(spec_of("scene.near=[]", path=PLAIN), "a.toml", "dirt") == Dirt()
     assert outside_from_kind(mixed) == outside_from_kind(obstruction_from_spec(dslr, "a.toml", "raindrop")) == "nothing"
     assert outside_from_kind(Dirt()) == "scene"
+
+
+def test_options_of_a_mixed_kind_name_the_part_that_they_are_for():
+    heavy = 'obstruction.options={dirt_clump=["6 mm", "12 mm"], dirt_share=0.2, fence_depth="0.3 m"}'
+    made = obstruction_from_spec(spec_of("obstruction.kind=dirt_raindrop_fence", heavy), "a.toml")
+    assert isinstance(made, DirtRaindropFence)
+    # The fence keeps its own distance; the others stand where the plate was made for.
+    assert made.dirt == Dirt(depth_m=(0.05, 0.12), clump_m=(6e-3, 12e-3))
+    assert (made.fence.depth_m, made.raindrop.depth_m, made.dirt_share) == ((0.3, 0.3), (0.05, 0.12), 0.2)
+    assert depth_range_m(made) == (0.05, 0.3)
+    for options, words in (("dirt_clumps=1", "options of dirt.*clump"), ("dirt_share=2", "dirt_share")):
+        with pytest.raises(InputError, match=words):
+            obstruction_from_spec(
+                spec_of("obstruction.kind=dirt_raindrop_fence", f"obstruction.options={{{options}}}"), "a.toml"
+            )
 
 
 def test_options_are_physical_parameters_with_units():

@@ -23,6 +23,8 @@ from sim.rigorous.crossed import has_crossed_solver
 from sim.rigorous.edge_optic import with_edges
 from tests.doedesign.small_runs import SPEC, call, finished_run
 
+pytestmark = pytest.mark.slow  # its fixtures take many seconds
+
 LEVELS = Levels(16, 75 * NM)
 COLOURS = (Colour("green", (550e-9,), (1.0,)), Colour("both", (550e-9, 650e-9), (0.5, 0.5)))
 CAMERA = Camera(Grid((64, 64), 1.85 * UM), 64 * 1.85 * UM, "fused_silica", COLOURS, 1e-3, 3.7 * UM, 48)

@@ -229,6 +229,7 @@ def test_chosen_depths_resume_to_the_last_bit(changes: list[str]) -> None:
         assert np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_the_design_stands_on_the_chosen_levels() -> None:
     spec = load_spec(QUICK, [*SMALL, *CHOSEN])
     problem, _ = problem_of(spec, {})

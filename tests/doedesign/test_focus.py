@@ -65,6 +65,7 @@ def designed(file: Path, *overrides: str):
     return design, focus_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
 
 
+@pytest.mark.slow
 def test_one_focus_is_a_lens(spec_file: Path):
     """Sixteen levels leave 98.7 % of an ideal lens's light, cells of 0.15 waves at the rim 96.3 % of that."""
     design, table = designed(spec_file)
@@ -123,6 +124,7 @@ def test_a_gaussian_beam_is_brought_to_its_focus(spec_file: Path):
     assert table.strength[0] > 0.93
 
 
+@pytest.mark.slow
 def test_two_foci_share_the_light(spec_file: Path):
     _, even = designed(spec_file, *BIFOCAL)
     # A splitter of two, the ceiling of 1 x 2 spots, has 0.405 in each with any phase.
@@ -133,6 +135,7 @@ def test_two_foci_share_the_light(spec_file: Path):
     assert uneven.strength[0] > 2 * uneven.strength[1]
 
 
+@pytest.mark.slow
 def test_every_colour_has_its_own_focus(spec_file: Path):
     own = ['focus.distances=["4 mm","5 mm","6 mm"]', 'focus.colours=["640nm","532nm","450nm"]']
     _, table = designed(spec_file, *COLOURS, *own, "optimize.steps=200")
@@ -179,6 +182,7 @@ def test_too_many_planes_are_refused(spec_file: Path):
         Foci.wanted(spec.focus, doedesign.camera_from_spec(spec))
 
 
+@pytest.mark.slow
 def test_a_stopped_design_goes_on_to_the_same_bytes(spec_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     leave_out_pictures(monkeypatch, optimization)
     few = [*BIFOCAL, "optimize.steps=40", "optimize.checkpoint_every=10"]
@@ -209,6 +213,7 @@ def test_a_stopped_design_goes_on_to_the_same_bytes(spec_file: Path, tmp_path: P
     assert parts.history == whole.history
 
 
+@pytest.mark.slow
 def test_a_run_holds_table_and_picture(spec_file: Path, tmp_path: Path):
     doedesign.optimize(spec_file, tmp_path / "run", overrides=[*BIFOCAL, "optimize.steps=20"])
     lines = (tmp_path / "run" / "focus.csv").read_text().splitlines()

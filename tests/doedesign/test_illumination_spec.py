@@ -142,6 +142,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, table: str, changes: list[str
     assert words in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_run_keeps_the_picture_of_its_beam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     leave_out_pictures(monkeypatch, optimization)
     grey = beam_picture(tmp_path / "beam.png")
@@ -182,6 +183,7 @@ def test_spots_of_a_gaussian_beam_are_equal(tmp_path: Path):
     assert lit.measures()["on_target"] > 0.75
 
 
+@pytest.mark.slow
 def test_modes_share_one_transfer_function(tmp_path: Path):
     """Fewer than the beam's modes would leave a larger coherent part: MTF of one mode of M² = 1 lies above."""
     design = optimize(spec_of(tmp_path, GAUSSIAN, "optimize.steps=2"))

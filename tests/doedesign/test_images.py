@@ -15,6 +15,7 @@ from doedesign.capture.images import (
     linear_light,
     picture_files,
     sample_files,
+    zoomed,
 )
 from fab.errors import InputError
 from fab.pictures import read_display
@@ -66,6 +67,24 @@ def test_windows_of_a_picture():
     large = crop(np.full((4, 8, 3), 50, np.uint8), (12, 12), (0.5, 0.5))
     assert large.shape == (12, 12, 3)
     assert np.all(large == 50)
+
+
+def test_a_share_of_a_picture():
+    y, x = np.mgrid[:60, :90]
+    picture = np.stack([4 * y, 2 * x, 0 * x], axis=-1).astype(np.uint8)
+    # All of the shorter side in half as many pixels: a pixel is the mean of two by two, inside the edges.
+    whole = zoomed(picture, (30, 30), 1.0, (0.0, 1.0)).astype(int)
+    rows, columns = 4 * (2 * np.arange(30) + 0.5), 2 * (30 + 2 * np.arange(30) + 0.5)
+    assert np.abs(whole[2:-2, 5, 0] - rows[2:-2]).max() <= 1
+    assert np.abs(whole[5, 2:-2, 1] - columns[2:-2]).max() <= 1
+    # The share that has as many pixels as the frame is cut as it is, and a mirror image is one.
+    np.testing.assert_array_equal(zoomed(picture, (30, 30), 0.5, (1.0, 1.0)), picture[30:, 60:])
+    mirrored = zoomed(picture, (30, 30), 0.5, (1.0, 1.0), True)
+    np.testing.assert_array_equal(mirrored, picture[30:, 60:][:, ::-1])
+    # A frame that is not square takes the largest window of its shape; a small share is enlarged.
+    assert zoomed(picture, (20, 60), 1.0, (0.5, 0.5)).shape == (20, 60, 3)
+    small = zoomed(picture, (32, 32), 0.1, (0.0, 0.0))
+    assert small[..., 0].max() <= 4 * 7
 
 
 def test_files_that_are_no_pictures_are_skipped_by_name(folder: Path, caplog: pytest.LogCaptureFixture):

@@ -64,6 +64,10 @@ def test_what_is_filled_in_is_written_and_stays(tmp_path: Path):
     text = spec_to_resolved_toml(spec, [])
     assert 'far = ["inf"]' in text
     assert 'pixel_angle = "0.0298 deg"' in text
+    # As the head of the file says.
+    assert text.startswith("# defaults are filled in; optional keys that are not here have their usual values\n")
+    assert "uniformity" not in text
+    assert "steps = " in text
     again = tmp_path / "again.toml"
     again.write_text(text)
     assert load_spec(again) == spec
@@ -123,6 +127,20 @@ def test_a_beam_takes_the_place_of_the_scene(tmp_path: Path):
     text = SPEC + '[illumination]\ndiameter = "0.2 mm"\n[sensor]\npixel_angle = "0.1 deg"\nwindow = 32\n'
     spec = spec_of(tmp_path, 'optimize={ steps = 0, start = "random" }', text=text)
     assert spec.scene.far_m == (math.inf,)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        ['spot={ count = [7, 7], period = "64 um" }'],
+        ['optimise={ start = "axicon", start_options = { angle = "1 deg" } }'],
+        ['optimize={ strat = "axicon", start_options = { angle = "1 deg" } }'],
+    ],
+)  # fmt: skip
+def test_a_slip_in_the_task_is_told_alone(tmp_path: Path, task: list[str]):
+    with pytest.raises(InputError, match=r"must be a known key.*Did you mean") as refused:
+        spec_of(tmp_path, *task)
+    assert "must be given" not in str(refused.value)
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,7 @@ def test_light_that_is_none_is_refused(tmp_path: Path, key: str, value: str):
         loaded(tmp_path, SPEC.replace("[doe]", f"{key} = {value}\n\n[doe]", 1))
 
 
+@pytest.mark.slow
 def test_a_run_says_its_light_and_its_psfs_have_it(run: Path):
     assert json.loads((run / "metrics.json").read_text())["light"] == "edges"
     design = dd.open_design(run)
@@ -80,6 +81,7 @@ def test_the_loss_is_of_the_light_that_was_asked_for(tmp_path: Path):
     assert abs(losses[1] / losses[0] - 1) > 1e-3
 
 
+@pytest.mark.slow
 def test_plates_as_fabricated_have_the_light_of_their_walls(run: Path):
     design = dd.open_design(run)
     thin = replace(design, camera=replace(design.camera, light="scalar"))
@@ -90,6 +92,7 @@ def test_plates_as_fabricated_have_the_light_of_their_walls(run: Path):
     np.testing.assert_array_equal(psf(drawn, depths=design.depths_m).energy, psf(design, depths=design.depths_m).energy)
 
 
+@pytest.mark.slow
 def test_captures_follow_the_design(run: Path):
     design = dd.open_design(run)
     thin = replace(design, camera=replace(design.camera, light="scalar"))
@@ -103,6 +106,7 @@ OBLIQUE = LIT.replace("window = 32", "window = 160").replace('near = ["6 mm"]', 
 OBLIQUE = OBLIQUE.replace("steps = 0", "steps = 2")
 
 
+@pytest.mark.slow
 def test_cells_that_are_split_for_walls_are_still_those_of_the_design(tmp_path: Path):
     run = finished_run(tmp_path, OBLIQUE)
     design = dd.open_design(run)

@@ -75,6 +75,7 @@ def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
     assert load_spec(path) == spec
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("distance", "least"), [pytest.param("5 mm", 0.6, marks=pytest.mark.slow), ("1.5 mm", 0.05)])
 def test_a_run_leads_to_a_verified_order_and_to_a_plate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, distance: str, least: float
@@ -87,13 +88,14 @@ def test_a_run_leads_to_a_verified_order_and_to_a_plate(
     row = metrics["psf"][0]
     assert row["far_spot"] > least
     assert sum(row["budget"].values()) == pytest.approx(1, abs=1e-5)
-    assert all(one["lens"] is None for one in metrics.get("accuracy", []))
+    assert all(one["lens_mapping"] is None for one in metrics.get("accuracy", []))
     made = fabricated(tmp_path / "run")
     assert made.rows["fabricated"][0]["far_spot"] == pytest.approx(row["far_spot"], rel=1e-3)
     write_masks(tmp_path / "run", tmp_path / "order")
     assert verify(tmp_path / "order").passed
 
 
+@pytest.mark.slow
 def test_a_design_is_optimised_for_a_sensor_near_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """From a flat start, at a distance for which the angular spectrum is needed."""
     leave_out_pictures(monkeypatch, optimization)
@@ -120,6 +122,7 @@ def test_orders_of_a_unit_cell_need_no_lens(tmp_path: Path):
         spec_of(tmp_path, *plain, 'spots={ count = [3, 3], spacing = "80 um" }')
 
 
+@pytest.mark.slow
 def test_an_area_is_lit_without_a_lens(tmp_path: Path):
     plain = ("optimize.start='flat'", "optimize.start_options={}", "optimize.steps=60", 'sensor.distance="50 mm"')
     area = 'area={ shape = "ellipse", width = "1.5 mm" }'

@@ -17,6 +17,7 @@ from doedesign.design.objectives import (
     PsfSet,
     equal_colours,
     far_spot,
+    filtered_error,
     handcrafted,
     import_objectives,
     near_spread,
@@ -261,6 +262,36 @@ def test_the_objectives_are_those_of_the_spec() -> None:
         without = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(point())[None, None], jnp.zeros((1, 0)), CAMERA)
         value = float(BUILT_IN[name](without, **given.get(name, {})))
         assert np.isnan(value) == (name in NEAR_OBJECTIVES), name
+
+
+def test_one_filter_for_all_depths_wants_psfs_that_are_alike() -> None:
+    """A point and a blur of 4 pixels, alone and together; light that is lost is lost in the picture's mean, too."""
+    blur = np.zeros((64, 64), np.float32)
+    blur[30:34, 30:34] = 1 / 16
+
+    def both(*far: np.ndarray) -> PsfSet:
+        return PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(np.stack(far))[None], jnp.zeros((1, 0)), CAMERA)
+
+    alike = [float(filtered_error(both(one, one))) for one in (point(), blur)]
+    apart, known = (float(filtered_error(both(point(), blur), known=way)) for way in (False, True))
+    assert alike[0] < alike[1] < apart
+    assert known == pytest.approx(np.mean(alike), rel=1e-4)
+    # The worst of both, under the filter that is best for their mean.
+    assert float(filtered_error(replace(both(point(), blur), worst=True))) > apart
+    # More noise, or less contrast, leaves more.
+    assert float(filtered_error(both(point(), point()), noise=0.02)) == pytest.approx(
+        float(filtered_error(both(point(), point()), contrast=0.125)), rel=1e-4
+    )
+    for options in ({"noise": 0.0}, {"contrast": -0.1}, {"noise": True}):
+        with pytest.raises(InputError, match="must be above 0"):
+            filtered_error(both(point()), **options)  # pyright: ignore
+
+
+def test_an_objective_of_all_depths_has_them_in_every_step() -> None:
+    """Its spec says so by itself."""
+    spec = load_spec(EXAMPLES / "wide_aperture.toml", ["objective=[{ name = 'filtered_error' }]"])
+    assert spec.objectives[0].compares
+    assert not load_spec(EXAMPLES / "quick.toml").objectives[0].compares
 
 
 THREE = [

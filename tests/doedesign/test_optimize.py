@@ -38,6 +38,7 @@ def run(
     return jax.tree.map(np.asarray, state), history
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parametrization", ["freeform", pytest.param("radial", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "quantisation",
@@ -54,6 +55,7 @@ def test_loss_falls(parametrization: str, quantisation: str) -> None:
     assert np.mean(history[-6:]) < np.mean(history[:6])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parametrization", ["freeform", pytest.param("radial", marks=pytest.mark.slow)])
 def test_gradient_of_the_whole_chain(parametrization: str) -> None:
     spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, f"optimize.parametrization={parametrization}"])
@@ -74,6 +76,7 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
     assert slope == pytest.approx(difference, rel=0.02, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_loss_is_the_mean_of_what_steps_see_in_turn() -> None:
     spec = load_spec(EXAMPLES / "quick.toml", SMALL)
     problem, scene = problem_of(spec, {})
@@ -175,6 +178,7 @@ def test_a_budget_becomes_a_number_of_steps(tmp_path: Path, monkeypatch: pytest.
         optimization.steps_within(load_spec(EXAMPLES / "quick.toml", ["objective=[]", "optimize.steps=0"]), 10.0)
 
 
+@pytest.mark.slow
 def test_a_descent_on_levels_lowers_the_loss_and_repeats() -> None:
     """Judged where it looks, a descent never ends higher; every cell ends on a level, and none went round."""
     spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.steps=4"])

@@ -113,6 +113,7 @@ def test_a_height_without_a_full_wave_is_said_so(design):
     assert predict_sheet(flat, Process(flat.levels), 550e-9).predictions.full_wave_m is None
 
 
+@pytest.mark.slow
 def test_compensated_masks_bring_the_expected_plate_back(design):
     process = Process(LEVELS, spreads=spreads_of(LEVELS, common_cd_bias_m=(80 * NM, 0.0)))
     moved = with_edge_moves(process, (-80 * NM,) * 4)

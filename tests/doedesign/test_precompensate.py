@@ -169,13 +169,15 @@ def test_what_is_drawn_anew_is_that_of_the_own_process(run: Path, tmp_path: Path
         precompensate(run, tmp_path / "else", **settings, random=["dust"])
 
 
+@pytest.mark.slow
 def test_a_search_finds_more_than_undoing_the_means(tmp_path: Path):
     """Walls that lean close openings by half of what they lean: edges and depths are found that make up for it."""
     run, path = finished_run(tmp_path, SPEC), tmp_path / "leaning.toml"
     path.write_text(ESTIMATE + WALLS)
     loss, found = {}, {}
     for evaluations in (0, 60):
-        found[evaluations] = precompensate(run, tmp_path / f"{evaluations}", process=path, evaluations=evaluations)
+        settings = {"process": path, "by": "loss", "evaluations": evaluations}
+        found[evaluations] = precompensate(run, tmp_path / f"{evaluations}", **settings)  # type: ignore[arg-type]
         design, process = found[evaluations], found[evaluations].process()
         rows = predict(design, process, process.expected()).rows
         # The objective of the spec is the light that misses the far spot.
@@ -201,11 +203,11 @@ def test_spots_areas_and_foci_judge_a_plate(text: str, changes: list[str], tmp_p
     assert losses[0] < losses[1] - 1e-3
 
 
-def test_psfs_may_judge_in_place_of_the_loss(tmp_path: Path):
+def test_a_plate_that_was_designed_is_judged_by_its_psfs(tmp_path: Path):
     """Where errors cancel, the least difference from the design is where they are undone, whatever the loss says."""
     run, path = finished_run(tmp_path, SPEC), tmp_path / "estimate.toml"
     path.write_text(ESTIMATE)
-    made = precompensate(run, tmp_path / "psfs", process=path, by="psfs", evaluations=20)
+    made = precompensate(run, tmp_path / "psfs", process=path, evaluations=20)
     undone = precompensate(run, tmp_path / "undone", process=path, evaluations=0)
     assert made.levels == undone.levels
     assert made.edge_moves_m == undone.edge_moves_m

@@ -35,6 +35,7 @@ def last_losses(design: Design) -> float:
     return float(np.mean([one["loss"] for one in design.history[-3:]]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sets", [[], ["optimize.drawn_pixel=3.7 um"]])
 def test_no_rule_is_ever_broken_and_little_is_lost(spec: Path, sets: list[str]) -> None:
     free, bound = (optimize(load_spec(spec, [*sets, *more])) for more in ([], ["optimize.min_feature=3.7 um"]))
@@ -61,6 +62,7 @@ def test_the_gradient_of_a_pixel_is_that_of_its_cells(spec: Path) -> None:
     np.testing.assert_allclose(slope, np.asarray(weight).reshape(24, 2, 24, 2).sum((1, 3)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_edges_are_fewer_where_walls_cost(spec: Path) -> None:
     def depth_of_walls(weight: float) -> int:
         design = optimize(load_spec(spec, ["optimize.min_feature=1 um", f"optimize.wall_weight={weight}"]))
@@ -70,6 +72,7 @@ def test_edges_are_fewer_where_walls_cost(spec: Path) -> None:
     assert depth_of_walls(3.0) < 0.8 * depth_of_walls(0.0)
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_with_its_printed_map(
     spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

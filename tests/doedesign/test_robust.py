@@ -113,6 +113,7 @@ def test_every_plate_counts_alike_in_the_mean(spec: Path, draws: int) -> None:
     assert compared.seen(1) == (range(draws), 1.0)
 
 
+@pytest.mark.slow
 def test_a_plate_has_the_light_of_the_model_of_the_process(spec: Path) -> None:
     """The PSF of heights times their deviation is that of the DOE as fabricated, from the axis of a far source."""
     task, problem, _ = task_of(spec)
@@ -127,6 +128,23 @@ def test_a_plate_has_the_light_of_the_model_of_the_process(spec: Path) -> None:
     np.testing.assert_allclose(ours, due, atol=2e-5 * due.max(), rtol=0)
 
 
+@pytest.mark.slow
+def test_a_window_wider_than_moments_of_whole_cells_reach(spec: Path) -> None:
+    """A plate as fabricated has halves of cells there; the steps stay on the cells, near to the light of those."""
+    wide = ROBUST.replace('pitch = "1.85 um"\naperture = "88.8 um"', 'pitch = "3.7 um"\naperture = "177.6 um"')
+    spec.write_text(wide.replace("window = 32", "window = 80"))
+    task, problem, _ = task_of(spec)
+    level = task.rules.blank.with_level(np.random.default_rng(1).integers(0, 4, (48, 48)).astype(np.uint8)).level
+    errors = task.variations(0, np.array([-1, -1]))[0]
+    made = as_fabricated(level, problem.camera, task.process, errors)
+    assert made.grid.shape == (96, 96)
+    optic = task.plate(level, errors).optic.with_heights(problem.parametrization.drawn_height(level))
+    ours, due = (np.asarray(psf(one, depths=(np.inf,)).energy) for one in (optic, made))
+    assert np.linalg.norm(ours - due) < 0.1 * np.linalg.norm(due)
+    assert len(optimize(load_spec(spec, ["optimize.steps=2", "robust.steps=2"])).history) == 4
+
+
+@pytest.mark.slow
 def test_the_risk_of_plates_falls(spec: Path) -> None:
     task, problem, scene = task_of(spec)
     nominal = optimize(load_spec(spec, ["optimize.steps=80", "robust.steps=0"]))
@@ -147,6 +165,7 @@ def test_the_risk_of_plates_falls(spec: Path) -> None:
     assert robust.history[-1]["names"] == robust.history[0]["names"] == ["far_spot", "near_spread"]
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_with_its_plates(spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robust_steps, "ROUND", 8)
     whole = optimize(spec, tmp_path / "whole")

@@ -14,6 +14,7 @@ from doedesign.capture.images import Pictures, picture_files
 from doedesign.capture.scenes import Batch, SceneData
 from fab.errors import InputError
 from sim.imaging.scene import Obstruction
+from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, Dirt
 
 VIEW = CameraView((24, 32), 3.7e-6, 8e-3)
@@ -64,6 +65,27 @@ def test_a_stream_may_start_anywhere(data: SceneData, folder: Path):
         assert all(same(a, b) for a, b in zip(whole[start:], take(fresh, 8 - start, start), strict=True))
     assert [batch.step for batch in whole] == list(range(8))
     assert not same(whole[0], take(replace(data, seed=4), 1)[0])
+
+
+def test_a_zoomed_stream_may_start_anywhere_and_shows_shares_of_pictures(folder: Path):
+    ramp = np.arange(100) + 50  # of display values, one per column of a picture of 60 x 100 pixels
+    for path in folder.iterdir():
+        Image.fromarray(np.broadcast_to(ramp[None, :, None], (60, 100, 3)).astype(np.uint8)).save(path)
+    pictures = Pictures(picture_files(folder))
+    data = SceneData(pictures, Bar(), CameraView((24, 24), 3.7e-6, 8e-3), (5.0, 10.0), seed=3, batch=4, zoom=(0.4, 1.0))
+    whole = take(data, 10)
+    fresh = replace(data, pictures=Pictures(picture_files(folder)), workers=1, ahead=1)
+    for start in (1, 3):
+        assert all(same(a, b) for a, b in zip(whole[start:], take(fresh, 10 - start, start), strict=True))
+    shown = [255 * srgb_from_linear(item.scene.background[0, 12]) for batch in whole for item in batch.items]
+    slopes = np.array([abs(row[20] - row[3]) / 17 for row in shown])  # columns of the picture per pixel
+    # From 0.4 to all of 60 rows in 24 pixels, each e-fold as often; bytes round to half of 1 at either end.
+    assert slopes.min() > 0.4 * 60 / 24 - 1 / 17
+    assert slopes.max() < 60 / 24 + 1 / 17
+    inner = np.log(slopes / (0.4 * 60 / 24)) / np.log(1 / 0.4)
+    assert np.mean(inner) == pytest.approx(0.5, abs=3 / np.sqrt(12 * len(inner)))  # three sigma of a mean of shares
+    with pytest.raises(ValueError, match="`zoom` must rise"):
+        replace(data, zoom=(0.5, 0.4))
 
 
 def test_an_epoch_shows_every_picture_once(data: SceneData):

@@ -33,6 +33,7 @@ from tests.doedesign.test_simulate_command import SPEC
 from tests.pictures import leave_out_pictures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model", ["paper", *(pytest.param(m, marks=pytest.mark.slow) for m in ("radiometric", "reciprocal"))]
 )
@@ -96,6 +97,7 @@ def test_in_memory_and_in_files_the_same(run: Path, design: Design, picture: Pat
     assert not np.array_equal(simulate(picture, design, **ASKED, seed=4).doe, shot.doe)
 
 
+@pytest.mark.slow
 def test_what_a_capture_knows_of_itself(design: Design, picture: Path):
     shot = simulate(picture, design, **ASKED)
     assert (shot.name, shot.occlusion) == ("a.png", "radiometric")

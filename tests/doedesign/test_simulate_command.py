@@ -94,6 +94,7 @@ def item_images(folder: Path) -> dict[str, np.ndarray]:
     return {name: read_image(folder, stored) for name, stored in described["images"].items()}
 
 
+@pytest.mark.slow
 def test_what_is_written(run: Path, images: Path, tmp_path: Path):
     result = simulate(run, tmp_path / "out", images)
     assert len(result["items"]) == 2
@@ -122,6 +123,7 @@ def test_broken_pictures_are_told_and_not_fatal(run: Path, images: Path, tmp_pat
     assert not any("broken" in name for name in result["items"])
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_and_a_stopped_one_goes_on(run: Path, images: Path, tmp_path: Path):
     simulate(run, tmp_path / "a", images)
     simulate(run, tmp_path / "b", images)

@@ -394,6 +394,8 @@ def test_mistakes_in_a_process_file(written: Callable[..., Path], tmp_path: Path
     path = written('[proces]\nlevels = 16\nlevel_step = "75 nm"\n')
     message = refusal(load_process, path)
     assert "proces: must be a known key of the spec, but got `proces`. Did you mean `process`?" in message
+    assert len(message.splitlines()) == 1
+    message = refusal(load_process, written("[glass]\nlevels = 16\n"))
     assert "process: must be given, but got nothing. Add a table [process]." in message
     assert "a process must be valid TOML" in refusal(load_process, written("[process\n"))
     assert str(tmp_path / "none.toml") in refusal(load_process, tmp_path / "none.toml")

@@ -29,7 +29,8 @@ def test_a_spec_without_them_stays_what_it_was():
     assert "[train]" not in spec_to_toml(spec)
     assert spec_digest(spec) == BEFORE
     # Saying the usual values is saying nothing.
-    assert load_spec(QUICK, [*BARE, "train.steps=50000", "network.width=12"]) == spec
+    usual = ["train.steps=50000", "network.width=12", "train.average=0", "network.global_light=false"]
+    assert load_spec(QUICK, [*BARE, *usual]) == spec
 
 
 def test_what_is_said_reads_back(tmp_path: Path):
@@ -37,6 +38,10 @@ def test_what_is_said_reads_back(tmp_path: Path):
     spec = load_spec(QUICK, changes)
     assert (spec.train.steps, spec.train.camera, spec.train.l1) == (7, "conventional", 0.5)
     assert (spec.network.depth, spec.network.refine) == (2, False)
+    newer = {"zoom", "average", "global_light"}
+    assert not newer & {*spec_to_json(spec)["train"], *spec_to_json(spec)["network"]}  # digests stay what they were
+    spec = load_spec(QUICK, [*changes, "train.zoom=[0.4, 1]", "train.average=0.99", "network.global_light=true"])
+    assert (spec.train.zoom, spec.train.average, spec.network.global_light) == ((0.4, 1.0), 0.99, True)
     (tmp_path / "again.toml").write_text(spec_to_toml(spec))
     assert load_spec(tmp_path / "again.toml") == spec == spec_from_json(spec_to_json(spec), "manifest.json")
     assert spec_digest(spec) != BEFORE
@@ -78,6 +83,12 @@ def test_what_moves(changes: list[str], network: bool, optics: bool):
         (["network.width=10"], ["network.width", "3 colours", "width = 9"]),
         (["network.features=false", "network.wiener=false"], ["network.features", "neither"]),
         (["network.variant=mine"], ["network.variant", "paper, release"]),
+        (["network.variant=release", "network.global_light=true"], ["network.global_light", "no veil and gain"]),
+        (["train.light_scenes=10"], ["train.light_scenes", "network.global_light = true"]),
+        (["train.zoom=[0.5, 0.4]"], ["train.zoom", "the smaller first", "zoom = [0.4, 0.5]"]),
+        (["train.zoom=[0.5, 1.1]"], ["train.zoom", "at most 1"]),
+        (["train.zoom=0.5"], ["train.zoom", "must be a list"]),
+        (["train.average=1.0"], ["train.average", "less than 1"]),
     ],
 )
 def test_what_is_refused(changes: list[str], words: list[str]):

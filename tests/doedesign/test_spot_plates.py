@@ -8,10 +8,11 @@ import pytest
 from doedesign.build import process_from_spec
 from doedesign.optimization import optimize
 from doedesign.spec import Spec, load_spec
+from doedesign.spec.targets.arrangements import grid_orders
 from doedesign.spots import design
 from doedesign.spots.design import SpotTask, orders_of_design
 from doedesign.spots.plates import SpotPlates, plates_of
-from doedesign.spots.spots import Spots, grid_orders, shares_of
+from doedesign.spots.spots import Spots, shares_of
 from doedesign.spots.superposition import SpotProblem, Staircase
 from fab.errors import InputError
 from fab.grid import Grid
@@ -126,6 +127,7 @@ def test_plates_come_in_opposite_pairs():
     assert found == plates_of(process, 6, 5) != plates_of(process, 6, 6)
 
 
+@pytest.mark.slow
 def test_an_exchange_never_loses_and_repeats_itself():
     levels = Levels(8, 144e-9)
     square = problem((12, 12), (3, 3), levels)
@@ -149,6 +151,7 @@ def cell_of(spec: Spec) -> tuple[SpotTask, np.ndarray]:
     return task, level[level.shape[0] // 2, : task.problem.grid.shape[1]][None].copy()
 
 
+@pytest.mark.slow
 def test_spots_stay_more_equal_on_plates_that_no_step_has_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # A quarter of the offers, for seconds instead of half a minute.
     for name in ("_TRIAL_OFFERS", "_LAST_OFFERS"):
@@ -168,6 +171,7 @@ def test_spots_stay_more_equal_on_plates_that_no_step_has_seen(tmp_path: Path, m
     assert kept_light > 0.97 * light
 
 
+@pytest.mark.slow
 def test_it_agrees_with_the_model_of_the_process(tmp_path: Path):
     """`sim.surface` cuts cells into pieces and keeps their moments; straight walls, so nothing is left out here."""
     spec = spec_of(tmp_path, *ROW)

@@ -6,10 +6,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from doedesign.spec.targets.arrangements import grid_orders, hexagonal_places, ring_places
 from doedesign.spots.exchange import exchange
 from doedesign.spots.orders import ceiling_of, order_table
 from doedesign.spots.search import search_phases, search_points
-from doedesign.spots.spots import Spots, grid_orders, hexagonal_places, ring_places, shares_of
+from doedesign.spots.spots import Spots, shares_of
 from doedesign.spots.superposition import SpotProblem, Staircase, WaveSet, spot_light
 from fab.aperture import RectangularAperture
 from fab.grid import Grid
@@ -206,6 +207,15 @@ def test_places_and_text_of_a_table():
     assert lines[0] == "order_x,order_y,x_mm,y_mm,efficiency,over_wanted"
     assert lines[2].startswith("0,0,0,0,1")
     assert "none known" in table.describe()
+    assert "0th order 100.000 % (one of the spots)" in table.describe()
+
+
+def test_an_even_grid_has_no_spot_in_the_0th_order():
+    height = np.random.default_rng(1).uniform(0, 1e-6, (64, 64))
+    for count, wanted in (((2, 2), False), ((3, 1), True), ((2, 3), False)):
+        table = order_table(HeightOptic.of(camera(64), height), orders_of(count, 16), period_m=16 * PITCH_M)
+        assert table.zeroth_order_wanted == wanted == ("one of the spots" in table.describe())
+        assert table.summary()["zeroth_order_wanted"] is wanted
 
 
 def test_ceilings_name_their_source():

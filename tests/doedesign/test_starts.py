@@ -178,6 +178,7 @@ def test_lens_and_rings_stand_side_by_side() -> None:
     assert np.mean(np.isclose(alone, lens(SETUP, power_per_m), atol=1e-12)) > 0.999
 
 
+@pytest.mark.slow
 def test_the_starts_are_those_of_the_spec() -> None:
     assert BUILT_IN.keys() == STARTS.keys()
     for name, options in STARTS.items():

@@ -12,7 +12,7 @@ from doedesign.optimization import optimize
 from doedesign.prediction import on_target
 from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_spec, spec_warnings
-from doedesign.templates import template_names, template_summary, template_text
+from doedesign.templates import EXAMPLES, template_names, template_summary, template_text
 from fab.order.verify import verify
 from tests.pictures import leave_out_pictures
 
@@ -43,10 +43,10 @@ LEAST = {
 
 
 def test_all_are_here() -> None:
-    assert template_names() == sorted(SMALL)
+    assert template_names() == sorted({*SMALL, *EXAMPLES})
 
 
-@pytest.mark.parametrize("name", sorted(SMALL))
+@pytest.mark.parametrize("name", template_names())
 def test_each_loads_without_a_warning(name: str, tmp_path: Path) -> None:
     path = tmp_path / "spec.toml"
     path.write_text(template_text(name))
@@ -76,9 +76,9 @@ def test_new_lists_and_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.chdir(tmp_path)
     assert main(["new"]) == 0
     listed = capsys.readouterr().out
-    assert all(name in listed for name in SMALL)
+    assert all(name in listed for name in template_names())
     assert main(["new", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out).keys() == SMALL.keys()
+    assert list(json.loads(capsys.readouterr().out)) == template_names()
     assert main(["new", "top_hat"]) == 0
     assert (tmp_path / "top_hat.toml").read_text() == template_text("top_hat")
     assert main(["new", "top_hat"]) == 2

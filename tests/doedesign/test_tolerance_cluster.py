@@ -2,10 +2,8 @@
 
 import dataclasses
 import json
-import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -14,63 +12,17 @@ from typing import Any
 
 import pytest
 
-from doedesign.tolerancing.cluster import evaluate_there
+from doedesign.runtime.cluster import evaluate_there
 from doedesign.tolerancing.pool import DrawModel, Rows
 from doedesign.tolerancing.studies import Study, study
 from fab.draws import normal_keys
 from fab.errors import InputError
 from fab.process import Variation, variation_of
+from tests.doedesign.local_cluster import Cluster
 
 pytest.importorskip("distributed", reason="the cluster extra is not installed")
 
 HERE = Path(__file__).parent
-# A test that fails must not leave processes behind: they end by themselves after this many seconds.
-LIFETIME_S = 120
-
-
-class Cluster:
-    """A scheduler with as many workers as were asked for."""
-
-    def __init__(self, folder: Path, allowed_failures: int = 3) -> None:
-        self.folder, self.allowed_failures = folder, allowed_failures
-        self.workers: list[subprocess.Popen[bytes]] = []
-        file = folder / "scheduler.json"
-        self.scheduler = self._start(
-            "scheduler", "--port", "0", "--scheduler-file", str(file), "--idle-timeout", f"{LIFETIME_S} s"
-        )
-        self._wait(lambda: file.exists() and file.stat().st_size > 0)
-        self.address = json.loads(file.read_text())["address"]
-
-    def _start(self, kind: str, *arguments: str) -> subprocess.Popen[bytes]:
-        allowed = str(self.allowed_failures)
-        paths = os.pathsep.join([str(HERE), str(HERE.parents[1])])  # the fakes, and the packages under test
-        settings = {"PYTHONPATH": paths, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": allowed}
-        command = [sys.executable, "-m", "dask", kind, "--host", "127.0.0.1", "--no-dashboard", *arguments]
-        with open(self.folder / f"{kind}{len(self.workers)}.log", "wb") as log:
-            return subprocess.Popen(command, env={**os.environ, **settings}, stdout=log, stderr=log, cwd=self.folder)
-
-    def _wait(self, ready: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 30
-        while not ready():
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-
-    def hire(self) -> subprocess.Popen[bytes]:
-        options = ("--nthreads", "1", "--no-nanny", "--memory-limit", "0", "--lifetime", f"{LIFETIME_S} s")
-        self.workers.append(self._start("worker", self.address, *options, "--death-timeout", "30"))
-        return self.workers[-1]
-
-    def staff(self, count: int) -> list[subprocess.Popen[bytes]]:
-        """So many workers that live."""
-        self.workers = [worker for worker in self.workers if worker.poll() is None]
-        while len(self.workers) < count:
-            self.hire()
-        return self.workers[:count]
-
-    def close(self) -> None:
-        for process in (*self.workers, self.scheduler):
-            process.kill()
-            process.wait()
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +106,7 @@ def test_workers_are_set_up_and_mistakes_are_told(
     assert set(refusing.beyond(normal_keys(20)).values()) == {"overlay_x: must stay below 0.5 um, but got more"}
     with pytest.raises(ZeroDivisionError):
         ask(evaluate=fakes.broken).monte_carlo(1)
-    monkeypatch.setattr("doedesign.tolerancing.cluster.__version__", "0.0.0")
+    monkeypatch.setattr("doedesign.runtime.cluster.__version__", "0.0.0")
     with pytest.raises(InputError, match=r"worker: must have doedesign 0\.0\.0"):
         ask().monte_carlo(1)
 
@@ -176,7 +128,7 @@ def test_a_plate_that_kills_its_workers_is_named(
 
 @pytest.mark.slow
 def test_nobody_there_is_told(ask: Callable[..., Study], monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr("doedesign.tolerancing.cluster._PATIENCE_S", 1.0)
+    monkeypatch.setattr("doedesign.runtime.cluster._PATIENCE_S", 1.0)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: a Dask scheduler must answer there.*dask scheduler"):
         ask(scheduler="tcp://127.0.0.1:9").monte_carlo(1)
     with pytest.raises(InputError, match="a Dask scheduler must answer there"):

@@ -21,8 +21,9 @@ from typing import Any, cast
 
 import pytest
 
+from doedesign.runtime.pool import default_workers
 from doedesign.tolerancing import studies as studies_module
-from doedesign.tolerancing.pool import DrawModel, default_workers
+from doedesign.tolerancing.pool import BYTES_PER_CELL, DrawModel
 from doedesign.tolerancing.studies import Study, study
 from fab.aperture import RectangularAperture
 from fab.draws import normal_keys
@@ -63,6 +64,7 @@ def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
+@pytest.mark.slow
 def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Study], fakes: ModuleType, right: dict):
     main = sys.modules["__main__"]
     before = {name: vars(main).get(name) for name in ("__file__", "__spec__")}
@@ -83,6 +85,7 @@ def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Stud
     assert {name: vars(main).get(name) for name in ("__file__", "__spec__")} == before
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_loses_no_plate(ask: Callable[..., Study], fakes: ModuleType, right: dict, tmp_path: Path):
     asked = ask(tmp_path, evaluate=fakes.rows_or_death_once, workers=2, out=tmp_path / "out")
     asked.monte_carlo(12)
@@ -297,7 +300,7 @@ def test_only_few_small_plates_in_memory_go_without_workers(
     ask: Callable[..., Study], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     asked: list[int] = []
-    monkeypatch.setattr("doedesign.tolerancing.studies.default_workers", lambda cells: 3)
+    monkeypatch.setattr("doedesign.tolerancing.studies.default_workers", lambda peak_bytes: 3)
     monkeypatch.setattr("doedesign.tolerancing.studies.evaluate_here", lambda *given: asked.append(given[-1]))
     model, plate = cast("DrawModel", None), variation_of(2, {})
     for out in (None, tmp_path / "out"):
@@ -309,12 +312,12 @@ def test_only_few_small_plates_in_memory_go_without_workers(
 
 def test_there_are_as_many_workers_as_cores_and_memory_allow(monkeypatch: pytest.MonkeyPatch):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    monkeypatch.setattr("doedesign.tolerancing.pool._free_gib", lambda: 1e3)
-    assert default_workers(2400**2) == cores
-    monkeypatch.setattr("doedesign.tolerancing.pool._free_gib", lambda: 2.5)
-    assert default_workers(2400**2) == 1
-    monkeypatch.setattr("doedesign.tolerancing.pool._free_gib", lambda: 0.1)
-    assert default_workers(100) == 1
+    monkeypatch.setattr("doedesign.runtime.pool.free_gib", lambda: 1e3)
+    assert default_workers(2400**2 * BYTES_PER_CELL) == cores
+    monkeypatch.setattr("doedesign.runtime.pool.free_gib", lambda: 2.5)
+    assert default_workers(2400**2 * BYTES_PER_CELL) == 1
+    monkeypatch.setattr("doedesign.runtime.pool.free_gib", lambda: 0.1)
+    assert default_workers(100 * BYTES_PER_CELL) == 1
 
 
 def test_a_study_knows_a_round_aperture_by_its_diameter_as_ever(fakes: ModuleType):

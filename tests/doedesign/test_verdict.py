@@ -55,6 +55,7 @@ def test_there_is_none_for_another_map_or_without_a_certificate(run: Path, tmp_p
     assert certified_orders(None, digest_of(run)) == ()
 
 
+@pytest.mark.slow
 def test_psf_puts_it_into_the_metrics(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     code, _, said = call("psf", run)

@@ -17,6 +17,7 @@ SMALL = ("doe.samples=96", "doe.aperture=0.192 mm", "spots.starts=20")
 SPLITTER = {"1 x 3": ([3, 1], "64 um", 3.0, 1.0)}
 
 
+@pytest.mark.slow
 def test_plates_of_a_process_without_errors_are_as_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(compare_splitters, "SPLITTERS", SPLITTER)
     drawn = compare_splitters.design_of("1 x 3", "as drawn", "contact_aligner", tmp_path, SMALL)

@@ -2,6 +2,8 @@
 
 import importlib.util
 import json
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -13,6 +15,7 @@ import doedesign.runs.psfs
 from doedesign.cli import main
 from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_spec, spec_warnings
+from fab.errors import CheckFailed
 from tests.pictures import leave_out_pictures
 
 pytestmark = pytest.mark.slow
@@ -85,28 +88,69 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def leave_out_report(patch: pytest.MonkeyPatch, demo: ModuleType) -> None:
+    """The page of a run whose pictures are left out; `test_demo_twice` has it whole."""
+    patch.setattr(demo, "write_report", lambda folder, order, out: out.write_text("<!doctype html>"))
+
+
 def test_demo_twice(demo: ModuleType, small: Path, tmp_path: Path):
     runs, masks = tmp_path / "runs", tmp_path / "masks"
-    summary = demo.demo(small, runs, masks)
+    summary = demo.made(small, runs, masks)
     for folder in (runs / "quick", masks / "quick", runs / "quick" / "psf"):
         assert str(folder) in summary
         assert (folder / "manifest.json").is_file()
+    assert f"report    {runs / 'quick' / 'report.html'}\n" in summary
+    assert (runs / "quick" / "report.html").read_text("utf-8").startswith("<!DOCTYPE html>")
     pictures = sorted(map(str, tmp_path.rglob("*.png")))
     assert pictures
     assert all(f"  {picture}\n" in f"{summary}\n" for picture in pictures)
     assert "656nm" in summary
     assert "every pixel of every file is as designed" in summary
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    assert demo.demo(small, runs, masks) == summary
+    assert demo.made(small, runs, masks) == summary
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == times
+
+
+def test_demo_designs_the_main_plate_beside_the_small_one(
+    demo: ModuleType,
+    small: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    caplog.set_level("INFO", "doedesign")
+    leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.runs.psfs)
+    leave_out_report(monkeypatch, demo)
+    main_spec, runs, masks = tmp_path / "main.toml", tmp_path / "runs", tmp_path / "masks"
+    main_spec.write_text(small.read_text().replace('name = "quick"', 'name = "main"'))
+    summary = demo.demo(small, main_spec, runs, masks)
+    shown = capfd.readouterr()
+    assert f"run       {runs / 'quick'}" in shown.out
+    assert f"run       {runs / 'main'}" in summary
+    # The small design is done, and says what to look at, before the main one is waited for.
+    looks = [shown.err.index(text) for text in (f"a first look: {runs / 'quick'}", "which was begun meanwhile")]
+    assert looks == sorted(looks)
+    # This process found the main run finished, by the one beside it.
+    assert f"{runs / 'main'} already holds the finished run" in caplog.text
+    assert f"{runs / 'quick'} already holds the finished run" not in caplog.text
+    assert demo.is_drawn(open_design(runs / "main"), masks / "main")
+
+
+def test_demo_says_that_the_other_process_failed(demo: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    (tmp_path / "log").write_text("begun\nfailed\n")
+    with subprocess.Popen([sys.executable, "-c", "raise SystemExit(2)"]) as process, pytest.raises(CheckFailed):
+        demo.wait(process, tmp_path / "log")
+    assert capfd.readouterr().err == "failed\n"
 
 
 def test_demo_takes_no_other_order_for_its_own(
     demo: ModuleType, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.runs.psfs)
+    leave_out_report(monkeypatch, demo)
     runs, masks = tmp_path / "runs", tmp_path / "masks"
-    demo.demo(small, runs, masks)
+    demo.made(small, runs, masks)
     run, order = runs / "quick", masks / "quick"
     assert demo.is_drawn(open_design(run), order)
     assert main(["masks", str(run), "--levels", "8", "--out", str(order)]) == 0
@@ -115,6 +159,6 @@ def test_demo_takes_no_other_order_for_its_own(
     monkeypatch.chdir(tmp_path / "runs")
     assert main(["psf", "quick"]) == 0
     assert not (run / "psf" / "from_masks.exr").exists()
-    demo.demo(small, runs, masks)
+    demo.made(small, runs, masks)
     assert demo.is_drawn(open_design(run), order)
     assert (run / "psf" / "from_masks.exr").exists()

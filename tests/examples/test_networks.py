@@ -9,12 +9,13 @@ import pytest
 
 from doedesign.capture.images import sample_files
 from doedesign.cli import main
+from doedesign.optimization import optimize
 from doedesign.recon.model import RELEASED, Model
 from doedesign.recon.photos import read_capture
 from doedesign.runs.level_maps import drawn_in_masks, open_design
 from doedesign.runs.psfs import psfs
 from fab.errors import InputError
-from fab.files import read_json, sha256_file
+from fab.files import canonical_json, read_json, sha256_file
 from sim.light import srgb_from_linear
 from sim.psf_bank import psf
 from tests.recon.small_training import SPEC
@@ -24,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import release_model  # pyright: ignore[reportMissingImports]
 import see_through  # pyright: ignore[reportMissingImports]
 import train_demo  # pyright: ignore[reportMissingImports]
+import train_released  # pyright: ignore[reportMissingImports]
 
 ROOT = Path(__file__).parents[2]
 
@@ -45,6 +47,31 @@ def test_the_released_model_is_what_its_manifest_says():
     masks = read_json(folder / "masks.json")
     design = open_design(folder, False)
     assert masks["level_map_sha256"] == design.level_map.digest
+
+
+def test_a_released_model_is_trained_on_free_pictures_alone(tmp_path: Path):
+    """Each with its licence; nothing that is trained on is judged by, nor shown with the model."""
+    data, out = tmp_path / "data", tmp_path / "out"
+    names = ("training_free/clic2025_a.jpg", "training_free/gb82_b.jpg", "training_free/SOURCES.md")
+    names += ("backgrounds_kodak/kodim02.png", "backgrounds_bsds500/val/c.jpg", "driving_720p/bdd_d.jpg", "other/e.jpg")
+    for name in names:
+        path = data / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    found = train_released.free_pictures(data, out)
+    entries = train_released.listed(found)
+    licences = {entry["name"]: entry["licence"] for entry in entries}
+    assert licences == found.licences
+    free = {"clic2025_a.jpg": "Unsplash License (CLIC 2025)", "gb82_b.jpg": "CC0 1.0 (GB82)"}
+    assert licences == free | {"kodim02.png": "unrestricted (Kodak PCD0992)"} | train_released.SAMPLES
+    assert found.test is not None
+    assert {path.name for path in found.test.iterdir()} == {"c.jpg", "bdd_d.jpg"}
+    assert all(entry["sha256"] == sha256_file(found.images / entry["name"]) for entry in entries)
+    assert sample_files()[0].name not in licences
+    # Without others, scikit-image's own, some of which are held out.
+    alone = train_released.free_pictures(tmp_path, tmp_path / "alone")
+    assert alone.test is None
+    assert set(alone.licences) == set(train_released.SAMPLES)
 
 
 @pytest.mark.slow
@@ -113,3 +140,36 @@ def test_the_demo_of_training_compares_what_it_trained(tmp_path: Path):
         release_model.release(plan.out / "paper_conventional_0", None, tmp_path / "released")
     release_model.release(folders[0], None, tmp_path / "released")
     assert Model.open(tmp_path / "released").colours == ("550nm",)
+
+
+@pytest.mark.slow
+def test_a_model_is_trained_behind_a_plate_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Behind a released plate, which has no heights before rounding and stays as it is; what is stopped goes on."""
+    spec = tmp_path / "small.toml"
+    spec.write_text(SPEC)
+    optimize(spec, tmp_path / "masks" / "plate")
+    manifest = tmp_path / "masks" / "plate" / "manifest.json"
+    said = read_json(manifest)
+    del said["results_sha256"]["height_continuous.exr"]  # as in a plate that is given away
+    manifest.write_bytes(canonical_json(said))
+    manifest.with_name("height_continuous.exr").unlink()
+    small = (
+        "train.steps=2",
+        "train.light_scenes=2",
+        "train.size=32",
+        "train.validation=2",
+        "network.width=1",
+        "network.refine=false",
+    )
+    pictures = train_released.free_pictures(tmp_path, tmp_path / "out")
+    monkeypatch.setitem(train_released.KINDS, "small", train_released.Kind("plate", '{ kind = "dirt" }'))
+    how = {"overrides": small, "masks": tmp_path / "masks"}
+    folder = train_released.trained("small", pictures, tmp_path / "out", "radiometric", **how)
+    assert train_released.trained("small", pictures, tmp_path / "out", "radiometric", **how) == folder
+    release_model.release(folder, None, tmp_path / "released", pictures=train_released.listed(pictures))
+    said, model = read_json(tmp_path / "released" / "manifest.json"), Model.open(tmp_path / "released")
+    assert {entry["name"] for entry in said["pictures"]} == set(train_released.SAMPLES)
+    assert said["trained"]["occlusion"] == model.about["occlusion"] == "radiometric"
+    assert model.network.light is not None
+    before, after = (open_design(at, False) for at in (tmp_path / "masks" / "plate", tmp_path / "released"))
+    assert before.level_map.digest == after.level_map.digest

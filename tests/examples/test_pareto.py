@@ -47,6 +47,7 @@ def test_a_free_form_beats_every_plate_of_a_formula(tmp_path: Path, capsys: pyte
     assert "written to" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_curve_of_the_bound_is_that_of_the_metrics():
     spec = load_spec(QUICK)
     camera, depths = camera_from_spec(spec), (*spec.scene.near_m, *spec.scene.far_m)

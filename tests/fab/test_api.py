@@ -89,6 +89,7 @@ class _Sound(HTMLParser):
         self.open -= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", ["contact_aligner", fab.Rules(3 * UM, 3 * UM), None])
 def test_a_check_draws_itself(process):
     from matplotlib.figure import FigureBase

@@ -207,6 +207,7 @@ def test_the_smallest_period_of_both_axes_is_found(period, shape):
     assert period_of(spoiled) == period
 
 
+@pytest.mark.slow
 def test_an_order_of_few_dies_with_six_levels_is_proved(tmp_path):
     levels = Levels(6, 100e-9)
     written = write_order(tmp_path / "order", repeated(8, levels=levels), wafer=FEW)

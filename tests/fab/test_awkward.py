@@ -65,6 +65,7 @@ MAPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("level_map", "count"), MAPS.values(), ids=MAPS.keys())
 def test_awkward_maps_make_orders_that_other_libraries_read_pixel_by_pixel(tmp_path, monkeypatch, level_map, count):
     # The picture for people takes most of the time of an order this small.

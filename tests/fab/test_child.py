@@ -16,6 +16,7 @@ def test_results_come_back_one_after_another():
         assert [child.result(one, 0) for one in begun] == [1, 2, 4]
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_is_told_and_the_next_work_is_done(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "_SECONDS", 1.0)
     monkeypatch.setattr(module, "_PATIENCE", 1.0)

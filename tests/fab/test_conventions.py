@@ -78,6 +78,7 @@ def test_the_depths_of_all_open_masks_make_the_height():
     np.testing.assert_allclose(1125e-9 - depth_m, height_of(level_map, LEVELS), atol=1e-21)
 
 
+@pytest.mark.slow
 def test_oasis_draws_the_same_way_up(tmp_path):
     write_order(
         tmp_path / "o", wide_map(one_pixel(3, 1, 14), LEVELS, GRID, "up"), chrome=Chrome(overlap_m=1e-6), wafer=FEW

@@ -64,6 +64,7 @@ def test_the_users_settings_change_neither_the_bytes_nor_are_they_changed():
         assert mpl.rcParams["font.size"] == 20
 
 
+@pytest.mark.slow
 def test_threads_draw_the_same_pictures():
     wanted = [png_bytes(plot_two(seed)) for seed in range(4)]
     before = dict(mpl.rcParams)

@@ -42,6 +42,7 @@ def entries(folder):
     return {entry.file.removeprefix(job): entry for entry in manifest.models}
 
 
+@pytest.mark.slow
 def test_a_radial_order_has_its_rings_as_exact_circles(tmp_path):
     level_map, profile = radial_map()
     write_order(tmp_path / "o", LevelMap(level_map, LEVELS, GRID, 59 * UM, "rings"), wafer=FEW)
@@ -147,6 +148,7 @@ def test_a_disk_too_full_to_compare_is_no_fault_of_the_file(written_order, tmp_p
         model_problems(written_order, plate, model)
 
 
+@pytest.mark.slow
 def test_a_mesh_alone_may_be_larger_and_a_step_patch_is_refused_before_anything_is_drawn(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     level_map = level_map_from(np.indices((60, 60)).sum(axis=0) % 2, LEVELS, UM, 60 * UM, "p")

@@ -103,6 +103,7 @@ def test_the_same_inputs_give_the_same_bytes_in_every_file(written_order, tmp_pa
         assert (again / name).read_bytes() == (written_order / name).read_bytes(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "step_nm", "shape", "fill"),
     [
@@ -135,6 +136,7 @@ def test_edges_that_had_to_be_rounded_are_stated_and_verify(tmp_path, levels):
     assert read_manifest(tmp_path / "o").pixel_edges.startswith("each pixel edge is rounded to 1 nm")
 
 
+@pytest.mark.slow
 def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, level_map):
     def crooked(bitmap, *edges):
         found = rectangles(bitmap, *edges)
@@ -148,6 +150,7 @@ def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, leve
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_earlier_order_is_replaced(order_folder, level_map):
     write_order(order_folder, replace(level_map, name="other"), wafer=FEW)
     assert read_manifest(order_folder).name == "other"

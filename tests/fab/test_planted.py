@@ -78,6 +78,7 @@ def test_a_request_with_a_word_for_a_length_is_refused(base, length):
         order_from({**manifest.request, "level_map": drawn}, np.load(base / manifest.level_map_file), "here")
 
 
+@pytest.mark.slow
 def test_an_order_of_another_version_is_proved_as_far_as_it_can_be(order_folder):
     def older(manifest):
         return replace(manifest, conventions={"axes": "said otherwise"}, tools={**manifest.tools, "doedesign": "0.0"})

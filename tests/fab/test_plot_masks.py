@@ -12,6 +12,7 @@ from tests.fab.maps import level_map_from
 from tests.pictures import dots_of, panel, require_place_of_axes, require_whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "shape"), [(2, (3, 5)), pytest.param(64, (70, 64), marks=pytest.mark.slow)])
 def test_the_bytes_depend_on_the_masks_alone(count, shape):
     level = np.random.default_rng(1).integers(0, count, shape)

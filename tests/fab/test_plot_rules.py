@@ -34,6 +34,7 @@ def blank(shape=(64, 64)):
     return np.full(shape, 15, np.uint8)
 
 
+@pytest.mark.slow
 def test_every_kind_of_breach_has_its_colour():
     clean = draw(blank())
     line, space = blank(), blank()

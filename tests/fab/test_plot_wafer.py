@@ -1,6 +1,7 @@
 """The picture of a mask plate."""
 
 import numpy as np
+import pytest
 
 from fab.aperture import RoundAperture
 from fab.figure import png_bytes
@@ -33,6 +34,7 @@ def plot(wafer, ax=None):
     return plot_wafer(wafer, frame, RoundAperture(4e-3), 1e-9, "plate", ax)
 
 
+@pytest.mark.slow
 def test_every_relief_is_there_and_the_bytes_repeat():
     pictures = (dots_of(plot(Wafer(dies=(3, 3)))), dots_of(plot(Wafer(dies=(2, 2)))))
     grey = [int((np.abs(255 * p - [0x8C, 0x8F, 0x94]).sum(axis=2) < 12).sum()) for p in pictures]

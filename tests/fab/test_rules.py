@@ -56,6 +56,7 @@ def own_places(plane, outside, fewest) -> set[tuple[int, ...]]:
     return found
 
 
+@pytest.mark.slow
 @given(BITMAPS, st.integers(2, 5))
 @settings(max_examples=150)
 def test_the_narrow_places_are_those_of_klayout(plane, fewest):

@@ -70,6 +70,7 @@ def test_a_square_opening_has_a_sinc_squared_in_the_sine():
     assert dark == pytest.approx(np.degrees(np.arcsin(WAVELENGTH / 80e-6)), abs=0.026)
 
 
+@pytest.mark.slow
 def test_there_is_no_light_beyond_a_sine_of_one():
     """A window whose corners lie at 1.41, looked at straight and from an axis 20 degrees aslant."""
     camera, tilt = camera_of(40, 0.05), float(np.radians(20))

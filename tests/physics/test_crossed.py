@@ -27,6 +27,7 @@ CELL, STEP, GREEN = 1.85e-6, 75e-9, 552e-9
 INDEX = refractive_index("fused_silica", GREEN)
 
 
+@pytest.mark.slow
 def test_a_bare_face_reflects_as_fresnel_says():
     orders = crossed_orders(np.zeros((2, 2)), 0.6e-6, GREEN, INDEX, 9)
     face = 4 * INDEX / (1 + INDEX) ** 2
@@ -35,6 +36,7 @@ def test_a_bare_face_reflects_as_fresnel_says():
     assert orders.transmitted.sum(1) == pytest.approx([face] * 2, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_a_relief_that_varies_along_one_axis_is_a_row(axis: str):
     """Walls across x are met by light along x as TM and by light along y as TE; turned by a right angle, vice versa."""
@@ -54,6 +56,7 @@ def test_a_relief_that_varies_along_one_axis_is_a_row(axis: str):
         assert own == pytest.approx(wanted, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_turned_relief_and_turned_light_go_together():
     """The same relief with x and y exchanged sends light of the other polarisation to exchanged orders."""
     height = 100e-9 * np.array([[0, 3], [1, 5]])
@@ -61,6 +64,7 @@ def test_turned_relief_and_turned_light_go_together():
     np.testing.assert_allclose(one.within(2, 2), other.within(2, 2)[::-1].transpose(0, 2, 1), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_orders_are_where_the_light_goes():
     """A prism of four steps along y sends light up: thin elements agree on the brightest order to a tenth."""
     height = np.tile(STEP * np.array([0, 4, 8, 12])[:, None], (1, 1))

@@ -38,6 +38,7 @@ def slit_intensity(x_m: np.ndarray, width_m: float, distance_m: float) -> np.nda
     return ((c1 - c0) ** 2 + (s1 - s0) ** 2) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", [pytest.param("fresnel", marks=pytest.mark.slow), "angular_spectrum"])
 @pytest.mark.parametrize("distance_m", [pytest.param(6e-3, marks=pytest.mark.slow), 20e-3])
 def test_square_opening(kernel: Kernel, distance_m: float):
@@ -55,6 +56,7 @@ def test_square_opening(kernel: Kernel, distance_m: float):
     assert got.sum(dtype=np.float64) == pytest.approx(wanted.sum(), rel=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zones", [2.0, *(pytest.param(zones, marks=pytest.mark.slow) for zones in (1.0, 3.0))])
 def test_circular_opening_on_the_axis(zones: float):
     """4 sin²(pi N / 2) times the open wave for Fresnel number N: bright for odd, dark for even numbers of zones."""
@@ -72,6 +74,7 @@ def smooth_plate(cells: int) -> np.ndarray:
     return np.mod(noise / noise.std() * 0.5, 1.2) * 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth_m", [pytest.param(np.inf, marks=pytest.mark.slow), 0.05])
 @pytest.mark.parametrize("defocus_m", [1e-4, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_far_field_agrees_with_the_direct_path(depth_m: float, defocus_m: float):

@@ -104,6 +104,7 @@ def test_light_of_walls_is_that_of_the_sum_over_walls(
         assert off(thin, expected) > 0.15
 
 
+@pytest.mark.slow
 def test_a_doe_has_views_where_near_and_far_light_are_too_different():
     """The window ends at 0.41 waves per cell, and the nearest source lights the rim with 0.28: 1.1 from end to end."""
     lens, height, depths = camera(64, 130, 1e-3), levels(64), (0.7e-3, 2e-3, np.inf)
@@ -140,6 +141,7 @@ def test_unpolarised_light_is_the_mean_of_both():
     assert off(np.asarray(found), np.mean(both, axis=0)) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_grating_sends_light_where_maxwell_does():
     """Orders of a blazed grating of four cells, as shares of the light through a bare face, per polarisation."""
     lens = camera(128, 256, 2.4e-3)
@@ -163,6 +165,7 @@ def test_a_grating_sends_light_where_maxwell_does():
         assert abs(orders[1] - expected.scalar[middle + 1]) > 0.02
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
     lens = camera(32, 32, 1e-3)
     height, way = levels(32) + 10e-9, levels(32, 3)
@@ -175,6 +178,7 @@ def test_gradients_are_those_of_finite_differences():
     assert float(slope) == pytest.approx(float(spot(2e-3) - spot(-2e-3)) / 4e-3, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("oblique", [False, True])
 def test_slopes_of_the_light_of_walls_are_those_of_differences(oblique: bool):
     """Cell by cell, at the rim too, where the weights of a line lie partly beyond the cells."""

@@ -136,6 +136,7 @@ def test_the_zeroth_order_weighs_cells_by_the_beam():
     assert found == pytest.approx((1 - 2 * share) ** 2, abs=0.01)  # the edge of the disc cuts cells of a 32nd of it
 
 
+@pytest.mark.slow
 def test_a_plate_as_fabricated_is_lit_by_the_beam():
     levels = Levels(4, 290e-9)
     level = np.random.default_rng(3).integers(0, 4, CAMERA.grid.shape).astype(np.uint8)

@@ -119,6 +119,7 @@ def test_lenses_that_do_not_image_sines(name: str, field_rad: tuple[float, float
     assert np.linalg.norm(straight[tuple(PIXELS.T)] - wanted) > 0.05 * np.linalg.norm(wanted)
 
 
+@pytest.mark.slow
 def test_bare_samples_see_the_lens_too(rng: np.random.Generator):
     """One sample per lambda d / D, as the optimiser takes them: as rough an estimate as behind a sine lens."""
     lens, (rows, columns) = replace(CAMERA, mapping="tangent"), rows_of(CAMERA)
@@ -137,6 +138,7 @@ def test_bare_samples_see_the_lens_too(rng: np.random.Generator):
     assert np.sum(moved * wanted) > 0.6 * np.linalg.norm(moved) * np.linalg.norm(wanted)
 
 
+@pytest.mark.slow
 def test_gradient_behind_a_tangent_lens(rng: np.random.Generator):
     camera, weights = replace(CAMERA, mapping="tangent"), rng.normal(size=(104, 104))
 

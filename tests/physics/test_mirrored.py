@@ -38,6 +38,7 @@ def test_a_plate_has_the_closed_form_of_two_faces(index: float):
     assert found.transmitted == pytest.approx(wanted.sum(), abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("along_x", [False, True])
 def test_orders_are_those_of_another_library(along_x: bool):
     fmmax = pytest.importorskip("fmmax")

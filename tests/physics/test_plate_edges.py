@@ -186,6 +186,7 @@ def small(**given: object) -> Camera:
     return replace(one, **given)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_without_errors_it_is_the_drawn_doe_with_edges_bit_for_bit():
     lens, depths = small(), (5e-3, np.inf)
     made = as_fabricated(level_map(), lens, Process(LEVELS), Variation(), depths_m=depths)
@@ -194,6 +195,7 @@ def test_without_errors_it_is_the_drawn_doe_with_edges_bit_for_bit():
     np.testing.assert_array_equal(zeroth_order(made), zeroth_order(drawn))
 
 
+@pytest.mark.slow
 def test_errors_that_vanish_lead_to_the_drawn_doe_with_edges():
     """Another sum than that of heights: lines keep second moments and a series of their widths, good to 0.2 nm."""
     lens = small(aperture=1.6 * 64 * CELL)  # no rim, whose cells have moments only where walls move

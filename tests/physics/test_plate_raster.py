@@ -226,6 +226,7 @@ def random_fields(cells: int, variation: Variation, depth_m: float, margin: int 
     return fields(level, SIXTEEN, variation, depth_m=depth_m, **given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n if "half" in n else pytest.param(n, marks=pytest.mark.slow) for n in RANDOM])
 def test_random_plates_are_those_of_a_raster_from_near_and_far(name: str):
     """Every cell a level of its own, a hard rim, the automotive window, one plate for 5 cm and for infinity."""
@@ -280,6 +281,7 @@ CLOSE = {"overlay_x_m": (F, -F, 2 * F, 0.0), "overlay_y_m": (F, -F, 0.0, 2 * F)}
 ALIKE_M = float(np.sqrt(32 / (1 - np.pi / 4))) * F
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("levels", "others", "red", "blue"),
     [

@@ -79,6 +79,7 @@ def test_a_common_depth_error_is_an_error_of_every_mask():
     np.testing.assert_allclose(np.asarray(both.transmission), np.asarray(each.transmission), atol=FLOAT32)
 
 
+@pytest.mark.slow
 def test_orders_of_a_blazed_grating_on_the_sensor():
     """The same through the whole path: chrome, transform, pixels. Boxes about the orders, against a flat plate's."""
     cells, per_order = 256, 15

@@ -61,6 +61,7 @@ def test_near_sources_light_cells_obliquely(plate: str, depth_m: float, defocus_
     assert relative_error(got, wanted) < 4e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth_m", [pytest.param(np.inf, marks=pytest.mark.slow), 0.02])
 def test_rings_against_a_raster_eight_times_finer(depth_m: float):
     camera = make_camera(192, 0.375e-3, 1.5e-3, 1.85e-6, 64)

@@ -42,6 +42,7 @@ def test_a_row_is_what_coupled_waves_say(period: float):
             assert own[order_of(cell, 0, number)] == pytest.approx(row.transmitted[row.at(number)], abs=5e-4)
 
 
+@pytest.mark.slow
 def test_a_row_along_y_is_one_along_x_turned():
     cell, level = blazed(3.01, 21)
     turned = SlabCell((12, 1), 3.01 * WAVE / 12, np.full(3, STEP), WAVE, GLASS, 21)
@@ -50,6 +51,7 @@ def test_a_row_along_y_is_one_along_x_turned():
     np.testing.assert_allclose(one, other[::-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_bare_glass_lets_through_what_fresnel_says():
     """Glass and air of any thickness before a bare face change nothing but phases: both slabs empty."""
     cell = SlabCell((2, 2), 0.4 * WAVE, np.full(2, STEP), WAVE, GLASS, 9)
@@ -66,6 +68,7 @@ def test_a_slab_with_a_share_of_glass_is_a_film_of_the_mean_permittivity():
     assert cell.transmitted(np.full((1, 2, 2), share)).sum(1) == pytest.approx([1, 1], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_squares_are_those_of_the_certificate():
     level = np.random.default_rng(1).integers(0, 3, (3, 4))
     cell = SlabCell((3, 4), 0.3 * WAVE, np.full(2, STEP), WAVE, GLASS, 40)
@@ -80,6 +83,7 @@ def judge_of(cell: SlabCell) -> Callable[[Any], Any]:
     return lambda orders: orders[0, places[0]] + 0.5 * orders[1, places[1]] ** 2
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_differences():
     cell, level = blazed(3.01, 15)
     filled = (0.1 + 0.8 * filled_of(level, 4)) * np.random.default_rng(2).uniform(0.8, 1, (3, 1, 12))
@@ -96,6 +100,7 @@ def test_the_gradient_is_that_of_differences():
         assert change[at] == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_squares_is_along_the_way_to_more():
     """Walls are held in their directions: a short step gains what the gradient promises, but for their turning."""
     cell = SlabCell((3, 3), 0.4 * WAVE, np.full(1, 2 * STEP), WAVE, GLASS, 20)

@@ -53,6 +53,7 @@ def test_tilted_light_is_that_of_a_plain_sum(camera: Camera):
     assert np.linalg.norm(image - expected) < 3e-3 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_tilted_light_on_a_bent_sensor_is_that_of_a_plain_sum():
     """Pixels that lie where they would without a bend; for an axis aslant the bend would have another middle."""
     camera, tilt = lens_of(40), (np.radians(-0.8), np.radians(2.1))
@@ -120,6 +121,7 @@ def _of_point(camera: Camera) -> tuple[tuple[Camera, float], tuple[Camera, float
     return (camera, 3e-3), (replace(camera, beam=EvenBeam(3e-3)), np.inf)
 
 
+@pytest.mark.slow
 def test_plates_as_fabricated_and_walls_are_seen_from_a_point_as_from_its_depth():
     levels = Levels(4, 290e-9)
     level = np.random.default_rng(3).integers(0, 4, (CELLS, CELLS)).astype(np.uint8)

@@ -20,6 +20,7 @@ import pytest
 import doedesign.optimization
 import doedesign.runs.psfs
 from doedesign.cli import main
+from doedesign.runs.folder import COST_NAME
 from tests.orders import GDS_TOO
 from tests.pictures import leave_out_pictures
 
@@ -173,9 +174,10 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def content() -> Callable[[Path], dict[str, bytes]]:
-    """Every file below a folder by its relative name, hidden ones too."""
+    """Every file below a folder by its relative name, hidden ones too; but the costs of a run, which a clock writes."""
 
     def read(folder: Path) -> dict[str, bytes]:
-        return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+        files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != COST_NAME]
+        return {str(p.relative_to(folder)): p.read_bytes() for p in files}
 
     return read

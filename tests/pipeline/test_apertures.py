@@ -59,6 +59,7 @@ def test_what_does_not_fit_a_rectangle_is_told_by_its_key(tmp_path, cli, old, ne
     assert words in done.err
 
 
+@pytest.mark.slow
 def test_a_bare_height_map_takes_width_and_height(tmp_path, cli):
     import numpy as np
 

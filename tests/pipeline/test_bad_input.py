@@ -133,9 +133,10 @@ def test_each_command_leaves_the_others_folders_alone(copied, tiny, cli, content
     before = content(copied.run), content(copied.order)
     refuse(cli("optimize", tiny, "--out", copied.order), copied.order, "format")
     refuse(cli("masks", copied.run, "--out", copied.run), copied.run, "format")
-    refuse(cli("masks", copied.order, "--levels", 16), copied.order, "format")
-    refuse(cli("verify", copied.run), copied.run, "format")
-    refuse(cli("psf", copied.order), copied.order, "format")
+    for command in ("masks", "psf", "report", "certify", "simulate", "tolerance", "precompensate", "refine", "train"):
+        images = ("--images", copied.run) if command == "train" else ()
+        refuse(cli(command, copied.order, *images), copied.order, "but got a mask order", "runs/tiny")
+    refuse(cli("verify", copied.run), copied.run, "but got a run", f"doedesign masks {copied.run}")
     assert (content(copied.run), content(copied.order)) == before
 
 
@@ -378,7 +379,8 @@ def test_geometry_that_cannot_be(cli, tmp_path, options, words):
 def test_file_of_another_kind(cli, tmp_path, tiny):
     from PIL import Image
 
-    refuse(cli("masks", tiny, *BARE), tiny, ".npy")
+    for geometry in (BARE, ()):
+        refuse(cli("masks", tiny, *geometry), tiny, ".npy", "but got a spec", f"doedesign optimize {tiny}")
     (tmp_path / "text.exr").write_text("not an EXR")
     refuse(cli("masks", tmp_path / "text.exr", *BARE), tmp_path / "text.exr", "OpenEXR")
     Image.new("RGB", (20, 15)).save(tmp_path / "colours.png")
@@ -419,6 +421,7 @@ def test_one_flipped_byte_fails_verify_and_is_named(copied, cli):
     assert cli("verify", copied.order).code == 0
 
 
+@pytest.mark.slow
 def test_files_missing_or_too_many_fail_verify(copied, cli):
     kept = b""
     for name in mask_files(copied.order):
@@ -466,10 +469,14 @@ def test_masks_of_another_run(copied, tiny, cli, content, tmp_path):
     refuse(
         cli("psf", copied.run, "--masks", order), order, "those of this run", "those of another", "doedesign masks RUN"
     )
-    assert cli("masks", copied.run, "--levels", 8, "--out", order).code == 0
+    drawn = content(order)
+    refuse(cli("masks", copied.run, "--levels", 8, "--out", order), order, 'the design "tiny"', "--overwrite")
+    assert content(order) == drawn
+    assert cli("masks", copied.run, "--levels", 8, "--out", order, "--overwrite").code == 0
     refuse(cli("psf", copied.run, "--masks", order), order, "16 levels of 75 nm", "8 levels of 150 nm")
     np.save(tmp_path / "map.npy", np.zeros((15, 20)))
-    assert cli("masks", tmp_path / "map.npy", *BARE, "--out", order).code == 0
+    refuse(cli("masks", tmp_path / "map.npy", *BARE, "--out", order), order, 'the design "tiny"', "--overwrite")
+    assert cli("masks", tmp_path / "map.npy", *BARE, "--out", order, "--overwrite").code == 0
     refuse(cli("psf", copied.run, "--masks", order), order, "64 x 64 pixels of 1.85 um", "15 x 20 pixels of 2 um")
     assert content(copied.run) == before
 

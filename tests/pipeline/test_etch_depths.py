@@ -150,6 +150,7 @@ def test_a_manifest_that_was_edited_is_noticed(tiny, cli, chosen, tmp_path):
         assert message in done.err
 
 
+@pytest.mark.slow
 def test_a_bare_map_takes_depths_from_the_command_line(cli, tmp_path):
     levels = Levels(4, 300e-9, (250e-9, 600e-9))
     level_map = np.random.default_rng(5).integers(0, 4, (24, 24)).astype(np.uint8)

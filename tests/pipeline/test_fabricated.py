@@ -41,6 +41,7 @@ def energies(run):
     return read_bank(run / "fabricated" / "fabricated.exr").energy
 
 
+@pytest.mark.slow
 def test_an_ideal_process_gives_the_quantised_design_to_the_last_bit(copy_of_run, cli):
     done = cli("psf", copy_of_run, "--fabricated")
     assert done.code == 0, done.err
@@ -62,6 +63,7 @@ def test_a_seed_is_repeated_and_its_variation_file_gives_the_same_plate(copy_of_
     assert not np.array_equal(energies(copy_of_run), first)
 
 
+@pytest.mark.slow
 def test_the_budget_of_a_plate_is_whole(copy_of_run, cli, process):
     assert cli("psf", copy_of_run, "--fabricated", "--process", process).code == 0
     rows = json.loads((copy_of_run / "fabricated" / "metrics.json").read_text())

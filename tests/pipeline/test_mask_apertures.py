@@ -119,6 +119,7 @@ def test_what_is_no_mask_of_the_doe_is_told_by_its_key(tmp_path, cli, spec, writ
     assert max(map(len, done.err.splitlines())) < 400
 
 
+@pytest.mark.slow
 def test_a_bare_height_map_takes_the_picture_of_its_aperture(tmp_path, cli):
     np.save(tmp_path / "steps.npy", np.full((64, 64), 1e-7, np.float32))
     write_pixels(tmp_path / "mask.png", plane().astype(np.uint8) * 255)

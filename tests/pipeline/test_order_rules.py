@@ -25,9 +25,11 @@ def test_a_process_that_prints_the_masks_says_nothing(finished):
     assert record["headlines"] == []
     # Its first etch is 75 nm, which is faint; of the masks nothing is said.
     (warning,) = [line for line in finished.said["masks"].err.splitlines() if line.startswith("warning")]
+    assert warning.endswith("add a zero layer of chrome marks (`[wafer] zero_layer = true`)")
     assert "the alignment marks are etched 75 nm deep" in warning
 
 
+@pytest.mark.slow
 def test_by_default_it_warns_and_shows_where(coarse, cli, tmp_path):
     done = cli("masks", coarse, "--out", tmp_path / "order")
     assert done.code == 0
@@ -46,6 +48,7 @@ def test_on_request_it_refuses_and_leaves_nothing(coarse, cli, tmp_path):
     assert not (tmp_path / "order").exists()
 
 
+@pytest.mark.slow
 def test_on_request_it_mends_the_map_and_says_what_that_costs(coarse, cli, tmp_path):
     done = cli("masks", coarse, "--out", tmp_path / "order", "--on-violation", "fix")
     assert done.code == 0, done.err

@@ -33,6 +33,7 @@ def test_a_freeform_design_is_ordered_with_a_flat_plate(finished):
     assert "drawn flat" in models(finished.order)["PLATE.step"]["content"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("option", "names"),
     [

@@ -9,6 +9,7 @@ from fab.order.verify import verify
 MASKS = Path(__file__).parents[2] / "masks"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["example"])
 def test_a_released_set_is_whole(name):
     report = verify(MASKS / name)

@@ -150,12 +150,14 @@ def test_what_a_killed_process_was_writing_is_cleared_away(copied, tiny, cli, co
     assert content(copied.run) == before
 
 
+@pytest.mark.slow
 def test_killed_before_the_manifest_was_whole(tiny, cli, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".manifest.json.k2_x81ab").write_bytes(b"half")
     assert cli("optimize", tiny, "--out", tmp_path / "run", "--set", "optimize.steps=0").code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_pictures")
 def test_the_last_call_tells_how_the_spec_came_about(tiny, cli, content, tmp_path, monkeypatch):
     """The same spec said in two ways: an edited file, or the override that was used at first."""

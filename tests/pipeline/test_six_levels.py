@@ -50,6 +50,7 @@ def test_masks_draw_the_six_levels_of_the_run(made):
     assert any("staircase 6 levels" in name for name in read_manifest(order).wafer.places_um)
 
 
+@pytest.mark.slow
 def test_a_design_of_six_levels_is_drawn_with_five(made, cli, tmp_path):
     done = cli("masks", made[0], "--levels", 5, "--out", tmp_path / "five")
     assert done.code == 0, done.err
@@ -58,6 +59,7 @@ def test_a_design_of_six_levels_is_drawn_with_five(made, cli, tmp_path):
     assert cli("verify", tmp_path / "five").code == 0
 
 
+@pytest.mark.slow
 def test_a_bare_map_of_three_levels(cli, tmp_path):
     level = np.random.default_rng(5).integers(0, 3, (24, 24))
     np.save(tmp_path / "map.npy", level * 400e-9)

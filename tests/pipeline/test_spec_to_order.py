@@ -31,6 +31,7 @@ def test_stdout_holds_paths_and_stderr_the_talk(finished):
     assert "Traceback" not in "".join(done.err for done in said.values())
 
 
+@pytest.mark.slow
 def test_json_lists_the_paths(finished, cli):
     told = json.loads(finished.said["psf"].out)
     assert [Path(path) for path in told["paths"][1:]] == sorted((finished.run / "psf").iterdir())
@@ -45,7 +46,8 @@ def test_the_run_folder_holds_what_its_manifest_lists(finished):
     manifest = json.loads((finished.run / "manifest.json").read_text())
     assert manifest["state"] == "done"
     assert manifest["name"] == "tiny"
-    found = {path.name for path in finished.run.iterdir()} - {"manifest.json", "psf"}
+    # What commands cost is no result.
+    found = {path.name for path in finished.run.iterdir()} - {"manifest.json", "psf", "cost.jsonl"}
     assert set(manifest["results_sha256"]) == found
     expected = {
         "level_map.npz",
@@ -56,7 +58,8 @@ def test_the_run_folder_holds_what_its_manifest_lists(finished):
         "spec.toml",
         "height.png",
     }
-    assert expected | {"psf.png", "mtf.png", "encircled.png", "history.png"} == found
+    pictures = {"psf.png", "mtf.png", "mtf.csv", "encircled.png", "encircled.csv", "history.png"}
+    assert expected | pictures == found
     for name, digest in manifest["results_sha256"].items():
         assert sha256_file(finished.run / name) == digest, name
 
@@ -184,6 +187,7 @@ def test_psf_of_one_side_of_the_scene(copied, cli, depth):
     assert len(read_bank(copied.run / "psf" / "quantised.exr").depths_m) == 1
 
 
+@pytest.mark.slow
 def test_fewer_levels_come_from_the_continuous_design(finished, cli, tmp_path):
     done = cli("masks", finished.run, "--levels", 4, "--out", tmp_path / "order")
     assert done.code == 0

@@ -109,6 +109,7 @@ def test_every_kind_draws_the_same_masks(cli, tmp_path, rng, kind):
     assert manifest["aperture_mm"] == pytest.approx(37 * PITCH_UM * 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape", [(1, 1), pytest.param((2, 90), marks=pytest.mark.slow), pytest.param((90, 3), marks=pytest.mark.slow)]
 )
@@ -166,6 +167,7 @@ line_splits = ["-100 nm"]
 """
 
 
+@pytest.mark.slow
 def test_a_bare_map_may_have_a_process_and_a_wafer_of_its_own(cli, tmp_path):
     height = np.kron(np.random.default_rng(3).integers(0, LEVELS, (7, 8)), np.ones((2, 2))) * STEP_M
     options = write_map(tmp_path / "a.npy", height, "npy")

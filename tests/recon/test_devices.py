@@ -222,6 +222,7 @@ class _TakenError(Exception):
     """The step would begin now."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes", [(), pytest.param(('train.precision="mixed"', "train.checkpointing=true"), marks=pytest.mark.slow)]
 )

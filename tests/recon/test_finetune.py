@@ -27,6 +27,7 @@ from fab.files import read_json, sha256_file
 from sim.light import linear_from_srgb, srgb_from_linear
 from sim.psf_bank import PsfBank
 from sim.store import read_bank, write_bank, write_picture
+from tests import compilations
 from tests.pictures import leave_out_pictures
 
 PIXEL = 3.7e-6
@@ -67,18 +68,10 @@ STEPS = 6
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Programs that one test compiled serve the others."""
-    names = {
-        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-    }
-    before = {name: getattr(jax.config, name) for name in names}
-    for name, value in names.items():
-        jax.config.update(name, value)
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
+    with compilations.kept_in(tmp_path_factory.mktemp("compiled")) as folder:
+        yield folder
 
 
 def bank(colours=("550nm",), depths=(0.05, 0.12, 5.0, np.inf), pixel=PIXEL, window=7) -> PsfBank:

@@ -17,10 +17,10 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from doedesign.cli import exit_code
-from doedesign.training import perceptual, similarity
-from doedesign.training.backbones import weight_shapes
-from doedesign.training.perceptual import Lpips, read_lpips, weights_of
-from doedesign.training.similarity import MsSsim
+from doedesign.training.distance import perceptual, similarity
+from doedesign.training.distance.backbones import weight_shapes
+from doedesign.training.distance.perceptual import Lpips, read_lpips, weights_of
+from doedesign.training.distance.similarity import MsSsim
 from fab.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -192,6 +192,7 @@ def test_unlike_pictures_are_refused(made):
         model(jnp.zeros((1, 2, 20, 20)), jnp.zeros((1, 2, 20, 20)))
 
 
+@pytest.mark.slow
 def test_equal_pictures_are_at_no_distance(made, rng):
     a, b = pictures(rng, (2, 3, *SIDE))
     for distance in (*(partial(lpips, made[name][0]) for name in ("squeeze", "alex")), quick_jit(MsSsim())):
@@ -209,6 +210,7 @@ def test_one_colour_stands_for_three(made, rng):
     np.testing.assert_allclose(lpips(model, a, b), grey, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_map_says_where(made, rng):
     """A change at low rows and high columns; the map's mean is the distance but for the edges of enlarged maps."""
     a, _ = pictures(rng, (1, 3, 96, 96))

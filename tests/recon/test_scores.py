@@ -10,8 +10,8 @@ import scipy.stats
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from doedesign.training import scores as scoring
-from doedesign.training.backbones import weight_shapes
-from doedesign.training.perceptual import Lpips, read_lpips
+from doedesign.training.distance.backbones import weight_shapes
+from doedesign.training.distance.perceptual import Lpips, read_lpips
 from doedesign.training.scores import mean_and_interval, paired_difference, scores
 
 psnr, ssim = eqx.filter_jit(scoring.psnr), eqx.filter_jit(scoring.ssim)

@@ -4,6 +4,7 @@ Networks are as small as they go, for the time goes into compiling steps.
 """
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import pytest
 
 from doedesign.capture.scenes import Batch
 from doedesign.spec.training import TrainSpec
+from doedesign.training.checkpoint import read_checkpoint, write_checkpoint
 from doedesign.training.joint import JointState, Trainer, devices_mesh, rates_at, resting_depths_m
 from doedesign.training.train import _with_options
 from fab.errors import InputError
@@ -108,9 +110,37 @@ def test_a_conventional_camera_has_a_flat_plate() -> None:
     assert not alike(numbers(one.doe), numbers(trainer(*PLAIN, 'train.freeze="optics"').doe))
 
 
+@pytest.mark.slow
+def test_the_mean_of_weights_is_that_of_its_steps(tmp_path: Path) -> None:
+    """By hand, in a checkpoint, and in what is looked at; the steps are those of a training without it."""
+    still = (*PLAIN, *LEARNING, 'train.freeze="optics"')
+    made, plain = trainer(*still, "train.average=0.6"), trainer(*still)
+    state, bare = made.initial(heights()), plain.initial(heights())
+    expected = numbers(state.network)
+    assert bare.average is None
+    assert bare.best is bare.network
+    for step in range(6):
+        state, _ = made.step(state, batch())
+        bare, _ = plain.step(bare, batch())
+        kept = min(0.6, (1 + step) / (10 + step))
+        expected = [kept * a + (1 - kept) * b for a, b in zip(expected, numbers(state.network), strict=True)]
+    assert alike(numbers(state.network), numbers(bare.network))
+    assert state.average is not None
+    for found, wanted in zip(numbers(state.best), expected, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-7)  # six means in single precision
+    write_checkpoint(tmp_path / "checkpoint.npz", state, state.step, "owner")
+    stored = read_checkpoint(tmp_path / "checkpoint.npz", made.initial(heights()), "owner")
+    assert stored is not None
+    assert alike(numbers(stored[0].average), numbers(state.average))
+    _, shown = made.reconstruct(state, batch())
+    _, by_hand = plain.reconstruct(bare._replace(network=state.average), batch())
+    np.testing.assert_array_equal(shown, by_hand)
+
+
 # --- what a step depends on ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_randomness_follows_from_seed_and_batch(joint: Trainer) -> None:
     def first(given: Batch, made: Trainer = joint) -> float:
         return made.step(made.initial(heights()), given)[1]["loss"]

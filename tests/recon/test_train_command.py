@@ -33,10 +33,10 @@ from doedesign.report.sheet import ValidationRow, plot_validation
 from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.level_maps import drawing_from, open_design
 from doedesign.spec import load_spec
-from doedesign.training.evaluation import split_pictures
 from doedesign.training.history import open_board, open_history, read_history
 from doedesign.training.joint import Trainer, layout_of
 from doedesign.training.train import train
+from doedesign.training.validation import split_pictures
 from fab.errors import InputError
 from fab.figure import save
 from fab.files import read_json
@@ -44,6 +44,7 @@ from fab.level_map import read_level_map
 from fab.pictures import read_display
 from sim.psf_bank import psf
 from sim.store import read_bank
+from tests import compilations
 from tests.doedesign.small_runs import finished_run
 from tests.pictures import leave_out_pictures, leave_out_pictures_of_orders
 
@@ -98,14 +99,8 @@ STEPS = 6
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Programs that one test compiled serve the others, and other processes."""
-    folder = tmp_path_factory.mktemp("compiled")
-    names = {"jax_compilation_cache_dir": str(folder), "jax_persistent_cache_min_compile_time_secs": 0.0}
-    before = {name: getattr(jax.config, name) for name in names}
-    for name, value in names.items():
-        jax.config.update(name, value)
-    yield folder
-    for name, value in before.items():
-        jax.config.update(name, value)
+    with compilations.kept_in(tmp_path_factory.mktemp("compiled")) as folder:
+        yield folder
 
 
 @pytest.fixture(scope="module")
@@ -224,6 +219,7 @@ def test_what_is_finished_stays(run: Path, images: Path, whole: Path):
     assert content(whole) == before
 
 
+@pytest.mark.slow
 def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
     rows = [ValidationRow(f"{k}.png: 20 dB", *rng.random((3, 3, 300, 200), np.float32)) for k in range(6)]
     save(plot_validation(rows, "small, step 3", "words " * 30), tmp_path / "a.png")
@@ -245,6 +241,7 @@ def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
         plot_training([], "small")
 
 
+@pytest.mark.slow
 def test_the_trained_plate_can_be_drawn(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -265,6 +262,7 @@ def test_a_training_without_a_plate_has_no_masks(
     assert "must hold a plate, level_map.npz" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_a_folder_the_model_is_what_is_left(run: Path, images: Path, whole: Path):
     """The same training in memory, but for a shorter one that an option asks for."""
     design = open_design(run, levels=4)
@@ -354,6 +352,7 @@ def test_stopped_in_between(
     assert content(tmp_path / "out") == content(whole)
 
 
+@pytest.mark.slow
 def test_stopped_at_every_few_writes(
     run: Path, images: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -451,6 +450,7 @@ def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Pa
     assert content(tmp_path / "out") == content(whole)
 
 
+@pytest.mark.slow
 def test_numbers_that_are_not_finite(run: Path, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The checkpoint before them is kept, and its place is told."""
     step = Trainer.step

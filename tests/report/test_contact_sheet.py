@@ -14,6 +14,7 @@ def row(label: str, side: int = 40) -> ContactRow:
     return ContactRow(label, light, light / 2, 2 * light, ramp, ramp)
 
 
+@pytest.mark.slow
 def test_sheet():
     rows = [row("first"), row("second", 700)]
 

@@ -120,6 +120,7 @@ def coloured(drawn: Axes | FigureBase, hue: np.ndarray) -> int:
     return int(np.all(np.abs(dots_of(drawn) - hue) < 0.02, axis=-1).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "draw",
     [lambda table: plot_histograms(table, table, CAMERA), plot_yield],
@@ -143,7 +144,7 @@ def test_a_longer_bar_is_a_larger_change():
 
 
 def test_an_error_is_named_in_words():
-    assert error_label("overlay_x_m[2]") == "overlay x, mask 2"
+    assert error_label("overlay_x_m[2]") == "overlay x, mask 3"
     assert error_label("sidewall_rad") == "sidewall"
     assert error_label("radial_nonuniformity") == "radial nonuniformity"
 

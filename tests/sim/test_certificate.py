@@ -13,6 +13,8 @@ from sim.rigorous import certify_pieces, certify_rows, compare_piece, compare_ro
 from sim.rigorous.certificate import CertifiedPiece, CertifiedRow
 from sim.rigorous.crossed import travelling_terms
 
+pytestmark = pytest.mark.slow  # its fixtures take many seconds
+
 PITCH_M = 1.85e-6
 GRID = Grid((100, 100), PITCH_M)
 APERTURE = RoundAperture(100 * PITCH_M)

@@ -70,6 +70,7 @@ def planned(name: str, moved: bool) -> tuple[Camera, FarField]:
     return camera, displaced(plan, jnp.array([0.4e-6, -0.7e-6])) if moved else plan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in RARE else n for n in PLANS])
 def test_value_and_gradient(name: str, moved: bool, rng: np.random.Generator):

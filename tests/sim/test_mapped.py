@@ -98,6 +98,7 @@ def test_the_way_back_is_the_transpose(fill: float, rng: np.random.Generator):
     assert np.vdot(np.asarray(back(weights)[0], np.float64), np.asarray(image)) == pytest.approx(forth, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_gradient_in_the_map(rng: np.random.Generator):
     """Of a turn, a stretch and a cubic bend, against differences."""
     image = np.zeros((SAMPLES, SAMPLES))

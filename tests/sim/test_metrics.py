@@ -105,8 +105,8 @@ def test_the_budget_sums_to_one(plate: str, fill: float, depth_m: float, rng: np
     budget = energy_budget(HeightOptic.of(camera, height), image, depth_m, camera.colours[0])
     assert sum(budget) == pytest.approx(1, abs=1e-9)
     assert budget.reflected == pytest.approx(0.0684, abs=1e-3)
-    assert budget.spot > 0
-    assert budget.window > 0
+    assert budget.far_spot > 0
+    assert budget.window_beside_spot > 0
     # Made from two independent transforms, each good to about 1e-4; a negative share would be energy from nowhere.
     assert budget.uncollected > -1e-3
     assert budget.higher_orders > -1e-3

@@ -29,6 +29,7 @@ from tests.pictures import panel, panel_dots, require_place_of_axes, require_who
 
 RGB = (Colour("656nm", (656e-9,), (1.0,)), Colour("589nm", (589e-9,), (1.0,)), Colour("486nm", (486e-9,), (1.0,)))
 CAMERA = Camera(Grid((64, 64), 1.85e-6), 116e-6, "fused_silica", RGB, 1e-3, 1.85e-6, 32)
+ONE_COLOUR = dataclasses.replace(CAMERA, colours=RGB[:1], window=40)
 NEAR, FAR = (2e-3, 4e-3), (0.5, np.inf)
 
 
@@ -86,6 +87,36 @@ def test_a_picture_takes_the_place_of_given_axes(name: str):
     require_place_of_axes(lambda ax: plot(name, ax=ax))
 
 
+def spots_at(*places: tuple[float, float]) -> PsfBank:
+    """A far PSF with spots at shares (across, up) of its window, on a faint ground."""
+    energy = np.full((1, 1, 40, 40), 1e-7, np.float32)
+    for across, up in places:
+        energy[0, 0, int(40 * up), int(40 * across)] = 0.1
+    return dataclasses.replace(random_bank(np.random.default_rng(1), 40, ONE_COLOUR, (np.inf,)), energy=energy)
+
+
+@pytest.mark.parametrize(
+    ("places", "aside"),
+    [
+        ([(0.5, 0.5)], False),
+        ([(0.5, 0.5), (0.8, 0.8)], True),  # under the inset
+        ([(0.5, 0.5), (0.2, 0.1)], True),  # under the words
+        ([(0.5, 0.5), (0.8, 0.1), (0.2, 0.8)], False),
+    ],
+)
+def test_inset_and_words_hide_no_spot(places: list[tuple[float, float]], aside: bool):
+    figure = plot_psfs(spots_at(*places), ONE_COLOUR, (), (np.inf,))
+    axes: Any = panel(figure, "far")
+    (inset,) = axes.child_axes
+    (words,) = (text for text in axes.texts if "window" in text.get_text())
+    frame = axes.get_window_extent()
+    for part in (inset.get_window_extent(), words.get_window_extent()):
+        assert (part.x0 >= frame.x1) == aside
+        assert part.overlaps(frame) == (not aside)
+    require_whole(figure)
+
+
+@pytest.mark.slow
 def test_light_of_a_wedge_that_thickens_upward_is_drawn_on_top():
     wave = full_wave_height_m("fused_silica", 589e-9)
     rise = np.linspace(0, 3 * wave, 64, dtype=np.float32)

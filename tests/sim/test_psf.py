@@ -14,6 +14,7 @@ ONE = make_camera(128, 0.3e-3, 0.54e-3, 1.85e-6, 32)
 HEIGHT = wrapped_map(128)
 
 
+@pytest.mark.slow
 def test_axes_are_wavelength_depth_y_x():
     camera = dataclasses.replace(ONE, colours=(Colour("a", (5e-7,), (1.0,)), Colour("b", (6e-7,), (1.0,))))
     calls = []

@@ -209,6 +209,7 @@ def test_each_tile_is_shifted_as_its_middle(level: np.ndarray, error: str):
     )
 
 
+@pytest.mark.slow
 def test_three_wavelengths_together_are_those_one_by_one(level: np.ndarray):
     """Behind the chrome, and rough, so that every factor that belongs to a wavelength is there."""
     lines = (656e-9, 550e-9, 486e-9)
@@ -426,6 +427,7 @@ WIDE = Camera(Grid((48, 48), 1.85e-6), 48 * 1.85e-6, "fused_silica", (RED, BLUE)
 NEAREST_M = 1e-3
 
 
+@pytest.mark.slow
 def test_a_wavelength_has_as_many_views_as_its_band_is_too_wide(level: np.ndarray):
     """The window takes 0.67 waves per cell in red and 0.90 in blue, near sources another 0.12 and 0.17 of the 0.965."""
     moved = as_fabricated(level, WIDE, PROCESS, Variation(common_cd_bias_m=1e-7), depths_m=(NEAREST_M, np.inf))

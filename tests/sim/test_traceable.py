@@ -74,6 +74,7 @@ def check(function: Callable[[Any], Any], at: Any, step: float, *, slope: float 
     assert found != 0
 
 
+@pytest.mark.slow
 def test_psfs_of_a_height_map():
     # Phases bend over a radian, 0.09 um of glass: steps of a thousandth of the heights leave 1e-4.
     check(lambda height: psf(height, ONE, DEPTHS_M).energy, HEIGHT_M, 2e-3)
@@ -153,6 +154,7 @@ def layers(rng: np.random.Generator) -> tuple[Any, ...]:
     return background, 0.2 + 0.5 * rng.uniform(0, 1, SHAPE), radiance, np.float64(10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [*(pytest.param(model, marks=pytest.mark.slow) for model in MODELS[:-1]), MODELS[-1]])
 def test_image_formation(rng: np.random.Generator, model: Model):
     """PSFs, images, mask and depth at once; from the bank through `Optics.of`, as a user goes."""

@@ -90,7 +90,7 @@ class LevelParametrization(eqx.Module):
         """Height that is optimised: quantised at softness 0, continuous at 1, blended between, or as chance has it.
 
         Without Gumbel's blend, the gradient with respect to `radians` is that of the continuous height. `depths_m` are
-        the depths of the etches, mask 0 first, if they are not those of the staircase; the gradient with respect to
+        the depths of the etches, first mask first, if they are not those of the staircase; the gradient with respect to
         them is that of the levels' heights, at the same nearest level.
         """
         height, softness = self.continuous_m(radians), rounding.softness

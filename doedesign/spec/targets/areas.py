@@ -58,18 +58,18 @@ class AreaSpec(SpecTable, frozen=True):
     }
 
     shape: Shape = Field(examples=['"rectangle"'])
-    width_m: Size | None = optional()
-    height_m: Size | None = optional()
-    inner_m: Size | None = optional()
-    edge_m: Annotated[float, place(0.1 * UM, 1.0)] | None = optional()
-    picture: str | None = optional()
-    phase: Annotated[str, Field(min_length=1)] | None = optional()
+    width_m: Size | None = optional(example='"330 um"')
+    height_m: Size | None = optional(example='"120 um"')
+    inner_m: Size | None = optional(example='"200 um"')
+    edge_m: Annotated[float, place(0.1 * UM, 1.0)] | None = optional(example='"20 um"')
+    picture: str | None = optional(example='"logo.png"')
+    phase: Annotated[str, Field(min_length=1)] | None = optional(example='"flat"')
     offset_m: tuple[Place, Place] = optional((0.0, 0.0))
     dark_m: Annotated[float, place(0.0, 1.0)] = optional(0.0)
     uniformity: NotNegative = optional(1.0)
     start: Literal["transport", "random"] = optional("transport")
-    colour: ColourName | None = optional()
-    distance_m: Annotated[float, length(10 * UM, 100.0)] | None = optional()
+    colour: ColourName | None = optional(example='"green"')
+    distance_m: Annotated[float, length(10 * UM, 100.0)] | None = optional(example='"50 mm"')
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -36,9 +36,9 @@ class FocusSpec(SpecTable, frozen=True):
 
     distances_m: tuple[Distance, ...] = Field(min_length=1, examples=['["5 mm", "1200 mm"]'])
     through: bool = optional(False)
-    widths_m: tuple[Width, ...] | None = optional()
-    weights: tuple[Positive, ...] | None = optional()
-    colours: tuple[str, ...] | None = optional()
+    widths_m: tuple[Width, ...] | None = optional(example='["6.6 um", "524 um"]')
+    weights: tuple[Positive, ...] | None = optional(example="[1.0, 2.0]")
+    colours: tuple[str, ...] | None = optional(example='["red", "green"]')
 
 
 def focus_problems(spec: "Spec") -> Iterator[InputError]:

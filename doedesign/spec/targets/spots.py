@@ -4,14 +4,19 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+import numpy as np
+from jaxtyping import Float
 from pydantic import Field, field_validator
 
+from doedesign.spec.targets.arrangements import grid_orders, hexagonal_places, ring_places
 from doedesign.spec.targets.beside import beside_problems, in_focus
 from doedesign.spec.values import PLACE, Count, NotNegative, Positive, bounded, broken, length, place
 from doedesign.spec.values.table import SpecTable, optional, toml_key
+from fab.aperture import RoundAperture
 from fab.errors import InputError
 from fab.units import MICROMETRES, MM, UM, format_length
 from sim.camera import sines_at
+from sim.illumination import GaussianBeam
 
 if TYPE_CHECKING:
     from doedesign.spec.models import Spec
@@ -33,7 +38,8 @@ class SpotsSpec(SpecTable, frozen=True):
         count: spots along x and along y. The orders of an even count are the odd ones.
         rings: hexagonal rings around the middle spot.
         number: spots on the circle.
-        spacing_m: distance of neighbouring spots on the sensor.
+        spacing_m: distance of neighbouring spots on the sensor, at least two spot widths, which are wavelength x focal
+            length / aperture each; nearer ones would count each other's light as their own.
         radius_m: radius of the circle on the sensor.
         places_m: [x, y] of every spot on the sensor.
         period_m: side of a unit cell that is repeated over the DOE, a whole number of DOE cells; the spots are its
@@ -52,16 +58,18 @@ class SpotsSpec(SpecTable, frozen=True):
     angles: ClassVar = dict.fromkeys(("spacing_m", "radius_m", "places_m", "offset_m"), PLACE)
 
     arrangement: Arrangement = "grid"
-    count: tuple[Count, Count] | None = optional()
-    rings: Annotated[int, Field(strict=True, ge=1, le=50)] | None = optional()
-    number: Annotated[int, Field(strict=True, ge=2, le=10_000)] | None = optional()
-    spacing_m: Separation | None = optional()
-    radius_m: Separation | None = optional()
-    places_m: tuple[tuple[Place, Place], ...] = optional(())
-    period_m: Annotated[float, length(0.02 * UM, 100 * MM)] | None = optional()
+    count: tuple[Count, Count] | None = optional(example="[7, 7]")
+    rings: Annotated[int, Field(strict=True, ge=1, le=50)] | None = optional(example="2")
+    number: Annotated[int, Field(strict=True, ge=2, le=10_000)] | None = optional(example="8")
+    spacing_m: Separation | None = optional(example='"250 um"')
+    radius_m: Separation | None = optional(example='"1 mm"')
+    places_m: tuple[tuple[Place, Place], ...] = optional((), example='[["0 mm", "1 mm"], ["0.5 mm", "-0.2 mm"]]')
+    period_m: Annotated[float, length(0.02 * UM, 100 * MM)] | None = optional(example='"192 um"')
     offset_m: tuple[Place, Place] = optional((0.0, 0.0))
-    weights: tuple[Positive, ...] = optional(())
-    phases_rad: tuple[Annotated[float, bounded("rad", -2 * math.pi, 2 * math.pi)], ...] = optional(())
+    weights: tuple[Positive, ...] = optional((), example="[1.0, 2.0, 1.0]")
+    phases_rad: tuple[Annotated[float, bounded("rad", -2 * math.pi, 2 * math.pi)], ...] = optional(
+        (), example='["0 deg", "90 deg", "0 deg"]'
+    )
     uniformity: NotNegative = optional(1.0)
     uniformity_as_fabricated: NotNegative = optional(0.0)
     starts: Annotated[int, Field(strict=True, ge=1, le=100_000)] = optional(200)
@@ -99,6 +107,15 @@ class SpotsSpec(SpecTable, frozen=True):
 _PLACING = ("count", "rings", "number", "spacing_m", "radius_m", "places_m", "period_m")
 _FEWEST_CELLS = 4  # of a unit cell
 MOST_CELLS = 2**16  # of a unit cell whose cells are exchanged one by one
+ONE_OF_THE_SPOTS = "one of the spots"  # said of a 0th order that is wanted
+# Distance of spots in spot widths, wavelength / aperture in direction sine. The efficiency of a spot is the light in
+# the plane wave that goes there, and two such waves share light on the aperture: sinc² of their distance if it is
+# square, (2 J1(pi u) / (pi u))² if it is round. Half a width apart they share half of it, and designs reach totals of
+# several times all light; one width apart it is 3 % for every neighbour, and totals reach 119 %. From two widths on it
+# is 0.4 % at most, 1.7 % if square: designs of 2 to 81 spots stayed below all light, 99.8 % at most.
+LEAST_WIDTHS = 2.0
+# Where spots of an arrangement that are too close are mended.
+_STEPS = {"grid": "spacing", "hexagonal": "spacing", "ring": "radius", "list": "places"}
 
 
 def spot_problems(spec: "Spec") -> Iterator[InputError]:
@@ -173,7 +190,9 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
             )
             cure = f"Choose a period of at least {least / UM:.4g} um, or finer cells."
             yield InputError("spots.period", rule, f"order {highest}", cure)
+        yield from _whole_period(spec)
         return
+    yield from _apart(spec)
     optics = spec.optics
     farthest, sine = 0.0, 0.0
     for y, x in corners(spots):
@@ -189,6 +208,99 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
         finer = format_length(wavelength / (2 * sine))
         cure = f"Bring the spots nearer to the axis, or choose a pitch of at most {finer}."
         yield InputError("spots", rule, f"a spot {got} from the axis", cure)
+
+
+def _whole_period(spec: "Spec") -> Iterator[InputError]:
+    """The rule that light passes one whole unit cell: of less than one, orders are too close to be told apart."""
+    spots: Any = spec.spots
+    opening = spec.doe.relief.shrunk(spec.process.chrome_overlap_m)
+    sides = [side for side, count in zip(opening.extent_m, reversed(spots.count), strict=True) if count > 1]
+    room, where = min(sides), "this aperture"
+    if isinstance(opening, RoundAperture):
+        room, where = room / math.sqrt(2), "the largest square in this aperture"
+    # A cell of the DOE more or less is of no account.
+    if spots.period_m >= room + spec.doe.pitch_m:
+        rule = f"one period at least must fit into {where}, {room / UM:.4g} um, or orders count each other's light"
+        cure = "Choose a shorter period or a larger aperture. Check the unit."
+        yield InputError("spots.period", rule, format_length(spots.period_m), cure)
+
+
+def _apart(spec: "Spec") -> Iterator[InputError]:
+    """The rule that spots lie apart far enough for their efficiencies to be shares of the light (`LEAST_WIDTHS`).
+
+    A grating sends every wavelength so many spot widths far, so that the first one speaks for all.
+    """
+    from scipy.spatial import KDTree  # not needed to read a spec without spots
+
+    spots: Any = spec.spots
+    wavelength, distance = spec.optics.colours[0].wavelengths_m[0], spec.image_distance_m
+    places = places_of(spots) + np.array(spots.offset_m[::-1])
+    sines = np.stack(sines_at(spec.optics.mapping, spec.optics.distortion, *(places / distance).T), axis=1)
+    if not np.isfinite(sines).all():
+        return  # without a lens, or beyond what it images, which is refused for itself
+    widths = wavelength / np.array(_lit_m(spec, wavelength))
+    apart, found = map(np.asarray, KDTree(sines / widths).query(sines / widths, k=2))
+    one = int(np.argmin(apart[:, 1]))
+    if apart[one, 1] >= LEAST_WIDTHS * (1 - 1e-6):
+        return
+    other = int(found[one, 1] if found[one, 1] != one else found[one, 0])
+    between = float(np.hypot(*(places[one] - places[other])))
+    # In their own direction, as far as they have one.
+    least = LEAST_WIDTHS * (between / apart[one, 1] if between else float(widths.max()) * distance)
+    key, unit = _STEPS[spots.arrangement], spec.told_in(MICROMETRES)
+    size = "wavelength / aperture" if spec.sensor.in_angles else "wavelength x focal length / aperture"
+    if spec.illumination is not None and spec.illumination.diameters_m:
+        size = size.replace("aperture", "lit aperture")
+    rule = (
+        f"spots must be at least {_rounded_up(float(unit.of(least)))} {unit.suffix} apart, two spot widths ({size}): "
+        "nearer ones count each other's light as their own"
+    )
+    got = f"{float(unit.of(between)):.4g} {unit.suffix}"
+    if spots.arrangement == "list":
+        got += f" between the places {min(one, other)} and {max(one, other)}"
+    elif spots.arrangement == "ring":
+        got += " between neighbours"
+    cure = {"places": "Move or remove one of them", "radius": "Choose a larger radius, fewer spots"}
+    cure = f"{cure.get(key, 'Choose a larger spacing')} or a larger aperture. Check the unit."
+    yield InputError(f"spots.{key}", rule, got, cure)
+
+
+def _rounded_up(value: float) -> str:
+    """Three digits that are no less than a positive number."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return f"{math.ceil(value / step - 1e-6) * step:.3g}"
+
+
+def _lit_m(spec: "Spec", wavelength_m: float) -> tuple[float, float]:
+    """Size (y, x) of what shapes a spot: the opening of the chrome, or a Gaussian beam that is smaller."""
+    # An opening that is none is refused elsewhere.
+    overlap, finest = spec.process.chrome_overlap_m, spec.doe.pitch_m
+    y, x = (max(side, finest) for side in spec.doe.relief.shrunk(overlap).extent_m)
+    light = spec.illumination
+    if light is None or light.kind != "gaussian" or not light.diameters_m:
+        return y, x
+    radii = (light.diameters_m[-1] / 2, light.diameters_m[0] / 2)
+    quality = (light.m_squared[-1], light.m_squared[0])
+    beam_y, beam_x = GaussianBeam(radii, light.waist_distance_m, quality).diameters_m(wavelength_m)
+    return min(y, beam_y), min(x, beam_x)
+
+
+def places_of(spots: SpotsSpec) -> Float[np.ndarray, "m 2"]:
+    """Places (y, x) of spots on the sensor about the middle of their arrangement, metres, or sines where there is none.
+
+    Args:
+        spots: a table that has what its arrangement needs, and no period.
+    """
+    if spots.arrangement == "list":
+        return np.array([place[::-1] for place in spots.places_m])
+    if spots.arrangement == "hexagonal":
+        return hexagonal_places(spots.rings or 0, spots.spacing_m or 0.0)
+    if spots.arrangement == "ring":
+        return ring_places(spots.number or 0, spots.radius_m or 0.0)
+    assert spots.count is not None
+    # Orders of an even count are the odd ones.
+    steps = [(spots.spacing_m or 0.0) / (1 if n % 2 else 2) for n in reversed(spots.count)]
+    return grid_orders(spots.count) * np.array(steps)
 
 
 def corners(spots: Any) -> Iterator[tuple[float, float]]:

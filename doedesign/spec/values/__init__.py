@@ -34,10 +34,13 @@ OBJECTIVES = (
     "window_share",
     "handcrafted",
     "target_pattern",
+    "filtered_error",
 )
 # The ways to round in the loop (`doedesign.design.levels.quantisation`) that draw levels at random.
 RANDOM_QUANTISATIONS = ("gumbel", "stochastic")
 NEAR_OBJECTIVES = ("near_spread", "handcrafted")
+# Those that have one answer for all depths, and look at all of them in every step.
+DEPTHS_OBJECTIVES = ("filtered_error",)
 
 # The built-in starts with their options; each is a function of the same name in `doedesign.design.starts`.
 STARTS = {
@@ -51,6 +54,7 @@ STARTS = {
     "blazed": ("period", "azimuth"),
     "lens_array": ("pitch", "focal_length"),
     "cubic": ("waves",),
+    "quartic": ("waves",),
     "axilens": ("near", "far"),
     "logarithmic_asphere": ("near", "far"),
 }
@@ -119,7 +123,57 @@ def _within(unit: str, low: float, high: float, value: Any, context: Any, also: 
     return number
 
 
-def bounded(unit: str, low: float, high: float, *, infinite: bool = False) -> BeforeValidator:
+@dataclass(frozen=True)
+class Within(BeforeValidator):
+    """Validator of a number that has bounds, which it tells to the reference of keys.
+
+    Attributes:
+        low: smallest number.
+        high: largest number.
+        unit: "m", "rad", or "1" for a plain number.
+        infinite: whether "inf" is allowed, too.
+        widest_rad: of a place on the sensor, the largest angle where there is none; None for other numbers.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = "1"
+    infinite: bool = False
+    widest_rad: float | None = None
+
+
+@dataclass(frozen=True)
+class Named(AfterValidator):
+    """Validator of text, which tells the reference of keys what it takes.
+
+    Attributes:
+        rule: what the text must be.
+        choices: names that are known.
+    """
+
+    rule: str = ""
+    choices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class OneOrList(BeforeValidator):
+    """Takes one value for a list of it, as `Within` tells of bounds."""
+
+
+@dataclass(frozen=True)
+class InWords:
+    """Beside the validator of a value of several kinds: what it takes, for the reference of keys.
+
+    Attributes:
+        kind: kinds of value.
+        limits: their limits.
+    """
+
+    kind: str
+    limits: str = ""
+
+
+def bounded(unit: str, low: float, high: float, *, infinite: bool = False) -> Within:
     """Return the validator of a quantity between two bounds in its SI unit, "m" or "rad"; "inf" may be allowed."""
 
     def validate(value: Any, info: ValidationInfo) -> float:
@@ -127,10 +181,10 @@ def bounded(unit: str, low: float, high: float, *, infinite: bool = False) -> Be
             return math.inf
         return _within(unit, low, high, value, info.context, ', or be "inf"' if infinite else "")
 
-    return BeforeValidator(validate)
+    return Within(validate, low=low, high=high, unit=unit, infinite=infinite)
 
 
-def length(low_m: float, high_m: float, *, infinite: bool = False) -> BeforeValidator:
+def length(low_m: float, high_m: float, *, infinite: bool = False) -> Within:
     """Return the validator of a length between two bounds, metres; "inf" may be allowed."""
     return bounded("m", low_m, high_m, infinite=infinite)
 
@@ -176,7 +230,7 @@ SIZE = HeldAngle(
 ANGLE = HeldAngle(float, float, math.pi)  # held as it is
 
 
-def place(low_m: float, high_m: float, kind: HeldAngle = PLACE) -> BeforeValidator:
+def place(low_m: float, high_m: float, kind: HeldAngle = PLACE) -> Within:
     """Return the validator of a place on the sensor or of a size there: a length between two bounds, metres.
 
     In a spec without a sensor it is an angle, held as a direction sine, a length at a distance of one metre.
@@ -198,10 +252,10 @@ def place(low_m: float, high_m: float, kind: HeldAngle = PLACE) -> BeforeValidat
             raise broken("must be greater than 0", "Choose a larger angle.")
         return sine
 
-    return BeforeValidator(validate)
+    return Within(validate, low=low_m, high=high_m, unit="m", widest_rad=kind.widest_rad)
 
 
-def share(low: float, high: float) -> BeforeValidator:
+def share(low: float, high: float) -> Within:
     """Return the validator of a plain number between two bounds, such as a fraction."""
 
     def validate(value: Any) -> float:
@@ -210,15 +264,15 @@ def share(low: float, high: float) -> BeforeValidator:
             raise broken(_range_rule(low, high, "{:g}".format) if number else "must be a number", "Write 5 % as 0.05.")
         return float(value)
 
-    return BeforeValidator(validate)
+    return Within(validate, low=low, high=high)
 
 
-def known(what: str, names: Collection[str]) -> AfterValidator:
+def known(what: str, names: Collection[str]) -> Named:
     """Return the validator of a name that must be one of `names`; `what` is what they are names of."""
     return accepted(names.__contains__, f"must be a known {what}", names)
 
 
-def accepted(accept: Callable[[str], Any], rule: str, choices: Collection[str] = ()) -> AfterValidator:
+def accepted(accept: Callable[[str], Any], rule: str, choices: Collection[str] = ()) -> Named:
     """Return the validator of text that `accept` takes."""
 
     def validate(text: str) -> str:
@@ -226,7 +280,7 @@ def accepted(accept: Callable[[str], Any], rule: str, choices: Collection[str] =
             raise broken(rule, nearest(text, choices) if choices else "Choose a plainer name.")
         return text
 
-    return AfterValidator(validate)
+    return Named(validate, rule=rule, choices=tuple(choices))
 
 
 Wavelength = Annotated[float, length(200 * NM, 20 * UM)]

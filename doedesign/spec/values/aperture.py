@@ -13,9 +13,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator, ValidationInfo, field_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
-from doedesign.spec.values import broken, length
+from doedesign.spec.values import InWords, broken, length
 from doedesign.spec.values.table import SpecTable
 from fab.aperture import MaskAperture
 from fab.aperture.mask import plane_of, rows_of
@@ -38,7 +38,7 @@ class MaskRows(SpecTable, frozen=True):
 
     inline: ClassVar[bool] = True
 
-    rows: tuple[tuple[int, ...], ...]
+    rows: tuple[tuple[int, ...], ...] = Field(examples=["[[2, 0, 2], [2, 1, 2]]"])
 
     @field_validator("rows", mode="before")
     @classmethod
@@ -78,7 +78,11 @@ def _aperture(value: Any, info: ValidationInfo) -> Any:
     return tuple(_SIZE(size, info) for size in value)
 
 
-ApertureSizes = Annotated[float | tuple[float, float] | MaskRows, BeforeValidator(_aperture)]
+ApertureSizes = Annotated[
+    float | tuple[float, float] | MaskRows,
+    BeforeValidator(_aperture),
+    InWords("length, list [width, height] of two, or file name of a picture", "1 um to 1 m each"),
+]
 
 
 def _cell_counts(value: Any) -> Any:
@@ -93,7 +97,11 @@ def _cell_counts(value: Any) -> Any:
     return tuple(counts) if counts is value else value
 
 
-Samples = Annotated[int | tuple[int, int], BeforeValidator(_cell_counts)]
+Samples = Annotated[
+    int | tuple[int, int],
+    BeforeValidator(_cell_counts),
+    InWords("whole number, or list [along x, along y] of two", f"2 to {_MOST} each"),
+]
 
 
 def shape_of(samples: int | tuple[int, int]) -> tuple[int, int]:

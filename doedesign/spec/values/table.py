@@ -23,9 +23,10 @@ def toml_key(attribute: str) -> str:
     return _SINGULAR.get(attribute, attribute.removesuffix("_m").removesuffix("_rad").removesuffix("_e"))
 
 
-def optional(default: Any = None) -> Any:
-    """Return a field that is written only where it differs from its default."""
-    return Field(default=default, exclude_if=lambda value: value == default)
+def optional(default: Any = None, example: str | None = None) -> Any:
+    """Return a field that is written only where it differs from its default; an `example` is TOML of a value."""
+    examples = None if example is None else [example]
+    return Field(default=default, exclude_if=lambda value: value == default, examples=examples)
 
 
 class SpecTable(BaseModel, frozen=True):

@@ -13,6 +13,7 @@ from sim.obstruction import (
     CameraView,
     Dirt,
     DirtRaindrop,
+    DirtRaindropFence,
     Fence,
     MaskFolder,
     ObstructionKind,
@@ -29,6 +30,7 @@ EXPECTED = {
     "raindrop": (AUTOMOTIVE, (0.05, 0.12), (0.03, 0.16)),
     "dirt": (AUTOMOTIVE, (0.05, 0.12), (0.15, 0.28)),
     "dirt_raindrop": (AUTOMOTIVE, (0.05, 0.12), (0.06, 0.25)),
+    "dirt_raindrop_fence": (AUTOMOTIVE, (0.05, 0.8), (0.08, 0.3)),
     "release_fence": (DSLR, (0.4, 0.8), (0.1, 0.35)),
     "release_raindrop": (AUTOMOTIVE, (0.05, 0.12), (0.01, 0.06)),
     "release_dirt": (AUTOMOTIVE, (0.05, 0.12), (0.2, 0.4)),
@@ -110,6 +112,24 @@ def test_the_coin_falls_on_either_side(background: np.ndarray):
         rng.bit_generator.state = state
         expected = Raindrop().draw(rng, AUTOMOTIVE, background)
         assert first(never, seed) == np.asarray(expected.mask).tobytes()
+
+
+def test_lots_fall_on_all_three(background: np.ndarray):
+    """One lot, then what that kind would draw by itself."""
+    three = DirtRaindropFence(dirt_share=0.5, raindrop_share=0.25)
+    counts = {Dirt: 0, Raindrop: 0, Fence: 0}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        lot = rng.uniform()
+        kind = Dirt() if lot < 0.5 else Raindrop() if lot < 0.75 else Fence()
+        counts[type(kind)] += 1
+        expected = kind.draw(rng, AUTOMOTIVE, background)
+        found = three.draw(np.random.default_rng(seed), AUTOMOTIVE, background)
+        np.testing.assert_array_equal(found.mask, expected.mask)
+        assert found.depth_m == expected.depth_m
+    assert min(counts.values()) >= 4
+    with pytest.raises(InputError, match="shares must add up to at most 1"):
+        DirtRaindropFence(dirt_share=0.7, raindrop_share=0.4)
 
 
 @pytest.mark.parametrize("kind", [Dirt, Fence, Raindrop])

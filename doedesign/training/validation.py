@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from doedesign.capture.images import picture_files
 from doedesign.report.sheet import ValidationRow
-from doedesign.training.perceptual import Lpips
+from doedesign.training.distance.perceptual import Lpips
 from doedesign.training.scores import scores
 from fab.errors import InputError
 from fab.files import explain_os_error, sha256_file

@@ -1,10 +1,10 @@
-"""Draws evaluated by the workers of a Dask cluster, wherever they run.
+"""Items of work evaluated by the workers of a Dask cluster, wherever they run.
 
     dask scheduler                                   # prints ADDRESS
     dask worker ADDRESS                              # of one thread, on as many machines as there are, with doedesign
     tolerance(design, scheduler=ADDRESS)
 
-Dask hands out the draws and hands those of a lost worker to another; this module only asks and listens.
+Dask hands out the items and hands those of a lost worker to another; this module only asks and listens.
 """
 
 import gc
@@ -17,9 +17,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from doedesign import __version__
-from doedesign.tolerancing.pool import DrawModel, named, single_thread_settings
+from doedesign.runtime.pool import Work, named, single_thread_settings
 from fab.errors import InputError
-from fab.process import Variation
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -27,33 +26,32 @@ if TYPE_CHECKING:
 log = logging.getLogger("doedesign")
 
 _PATIENCE_S = 30.0
-_KEPT = "Finished draws are kept."
 
 
-def evaluate_there(model: DrawModel, draws: Mapping[str, Variation], address: str) -> Iterator[tuple[str, Any]]:
-    """Evaluate draws, by key, by the workers of the Dask scheduler at an address such as "tcp://10.0.0.1:8786".
+def evaluate_there(work: Work, items: Mapping[str, Any], address: str) -> Iterator[tuple[str, Any]]:
+    """Evaluate items, by key, by the workers of the Dask scheduler at an address such as "tcp://10.0.0.1:8786".
 
     Yields:
-        key and result of every draw, as they are finished.
+        key and result of every item, as they are finished.
 
     Raises:
-        InputError: no Dask here, no scheduler or no workers there, workers without this version of doedesign, or a
-            draw that ended its worker again and again.
+        InputError: no Dask here, no scheduler or no workers there, workers without this version of doedesign, or an
+            item that ended its worker again and again.
     """
     finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
     with _client(address) as client:
         # A task, and no scattered value: whoever holds it may be lost.
-        held = client.submit(_held, model, key=f"doedesign-{model.token}", pure=False)
+        held = client.submit(_held, work, key=f"doedesign-{work.token}", pure=False)
         waiting: dict[Future, str] = {}
-        for key, variation in draws.items():
-            name = f"doedesign-draw-{model.token}-{key}"
-            future = client.submit(_evaluate, held, variation, __version__, key=name, pure=False)
+        for key, item in items.items():
+            name = f"doedesign-{work.noun}-{work.token}-{key}"
+            future = client.submit(_evaluate, held, item, __version__, key=name, pure=False)
             waiting[future] = key
             future.add_done_callback(finished.put)
         while waiting:
-            future = _next(finished, client, address)
+            future = _next(finished, client, work.noun, address)
             key = waiting.pop(future)
-            yield key, _rows(future, key, address)
+            yield key, _result(future, work.noun, key, address)
 
 
 @contextmanager
@@ -85,7 +83,7 @@ def _client(address: str) -> "Iterator[Client]":
         yield client
 
 
-def _next(finished: "queue.SimpleQueue[Future]", client: "Client", address: str) -> "Future":
+def _next(finished: "queue.SimpleQueue[Future]", client: "Client", noun: str, address: str) -> "Future":
     """The next future that is done, however long it takes."""
     warned = False
     while True:
@@ -95,45 +93,45 @@ def _next(finished: "queue.SimpleQueue[Future]", client: "Client", address: str)
             try:
                 working = client.nthreads()
             except OSError as error:
-                raise _lost(address) from error
+                raise _lost(noun, address) from error
             if not working and not warned:
                 log.warning(f"no worker is left at {address}; waiting for new ones")
                 warned = True
 
 
-def _rows(future: "Future", key: str, address: str) -> Any:
+def _result(future: "Future", noun: str, key: str, address: str) -> Any:
     from distributed import KilledWorker
     from distributed.client import FutureCancelledError
 
     try:
-        return named(key, future.result)
+        return named(f"{noun} {key}", future.result)
     except KilledWorker as error:
         got = f"several that ended while they computed it, the last one {error.last_worker.address}"
-        cure = f"Give workers more memory, or evaluate it alone. {_KEPT}"
-        raise InputError(f"draw {key}", "a worker must live through a draw", got, cure) from error
+        cure = f"Give workers more memory, or evaluate it alone. Finished {noun}s are kept."
+        raise InputError(f"{noun} {key}", f"a worker must live through a {noun}", got, cure) from error
     except FutureCancelledError as error:
-        raise _lost(address) from error
+        raise _lost(noun, address) from error
     except ModuleNotFoundError as error:
         cure = f"Install doedesign {__version__} where the workers run."
         raise InputError(address, "the workers must have what the study needs", f'"{error}"', cure) from error
 
 
-def _lost(address: str) -> InputError:
-    cure = f"Start it again and repeat the study. {_KEPT}"
+def _lost(noun: str, address: str) -> InputError:
+    cure = f"Start it again and repeat the command. Finished {noun}s are kept."
     return InputError(address, "the scheduler must stay reachable", "a lost connection", cure)
 
 
 # What follows runs in a worker.
 
 
-def _held(model: DrawModel) -> DrawModel:
-    return model
+def _held(work: Work) -> Work:
+    return work
 
 
-def _evaluate(model: DrawModel, variation: Variation, version: str) -> Any:
+def _evaluate(work: Work, item: Any, version: str) -> Any:
     if version != __version__:
         cure = "Install the same version everywhere."
         raise InputError("worker", f"must have doedesign {version}", __version__, cure)
     if "jax" not in sys.modules:
         os.environ.update(single_thread_settings())
-    return model(variation)
+    return work(item)

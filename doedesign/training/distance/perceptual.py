@@ -26,8 +26,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from doedesign.training.backbones import LEAST_PX, Backbone, backbone_of, convolutions, taps_of, weight_shapes
-from doedesign.training.similarity import Images, MsSsim
+from doedesign.training.distance.backbones import LEAST_PX, Backbone, backbone_of, convolutions, taps_of, weight_shapes
+from doedesign.training.distance.similarity import Images, MsSsim
 from fab.errors import InputError
 from fab.files import opened, sha256_file
 from fab.pictures import decoding

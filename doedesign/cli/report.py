@@ -1,0 +1,47 @@
+"""The page of a run: report."""
+
+from pathlib import Path
+
+from doedesign.cli.console import print_paths, say
+from doedesign.cli.options import AsJson, Flag
+from fab.errors import InputError
+
+
+def report(
+    run: Path,
+    *,
+    compare: tuple[Path, ...] = (),
+    watch: Flag = False,
+    order: Path | None = None,
+    out: Path | None = None,
+    json_: AsJson = False,
+) -> None:
+    """Write one HTML file with all that is known of a run: it opens from the disk, without a network.
+
+    Maps to zoom to single pixels, PSFs by depth and colour, yield, the order as a model to turn, and where every number
+    comes from. Parts appear once their data exist: psf, masks, tolerance, simulate, train and evaluate add to it.
+
+    Args:
+        run: Run folder, finished or at work.
+        compare: Other runs to put beside it, with their differences.
+        watch: Write it again whenever the run has changed, until nothing in it is at work; stop with Ctrl-C.
+        order: The run's mask order; masks/NAME by default.
+        out: The file; RUN/report.html by default, RUN/comparison.html beside others.
+    """
+    from doedesign.report.page.write import watch_report, write_report
+
+    if not watch:
+        written = write_report(run, compare=compare, order=order, out=out)
+        print_paths([written], json_)
+        say(f"look at: {written}")
+        return
+    if compare:
+        raise InputError("--watch", "follows one run", "others to compare with", "Leave out --compare.")
+    written = None
+    try:
+        for written in watch_report(run, order=order, out=out):
+            say(f"written {written}; reload it in the browser")
+    except KeyboardInterrupt:
+        say("stopped watching")
+    if written is not None:
+        print_paths([written], json_)

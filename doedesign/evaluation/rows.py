@@ -1,0 +1,209 @@
+"""Rows of the two tables: what each looks at, through which plate, and by which method.
+
+A plate is named by the training that it came out of, or "flat" for a conventional camera. Of a plate as fabricated,
+pair i sees draw i of the process (modulo their number), and its network is told the PSFs of that very plate ("right"),
+as a lab would that measured them, or those of the design ("drawn").
+
+Single-image methods get what the paper gives them: the true mask, and inpainting the sharp scene around the hole, which
+no camera sees. Rows ending in `_of_capture` are the same methods given what a conventional camera does see.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from fab.errors import InputError
+
+FLAT = "flat"
+ROBUST = "robust"
+
+Sees = Literal["capture", "scene"]
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a network that rows need is trained.
+
+    Attributes:
+        name: name of its folder.
+        changes: changes to the design's spec, "table.key=value".
+        rival: a network after a published idea (`doedesign.evaluation.rivals`) instead of the project's own.
+        plate: training whose plate it stands behind and leaves as it is; None for the design to begin with.
+    """
+
+    name: str
+    changes: tuple[str, ...] = ()
+    rival: str | None = None
+    plate: str | None = None
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """One row of a table.
+
+    Attributes:
+        name: name in files.
+        label: name for people.
+        method: one of `METHODS`, "network" or "rival".
+        training: whose weights the method has.
+        plate: training whose plate the camera has, or "flat".
+        sees: "capture", or "scene" where the method is given the sharp scene.
+        fabricated: whether the plate is as fabricated.
+        told: PSFs that the method is told: "right", or "drawn" for those of the design.
+        paper: row of the paper's table; None for what the paper does not have.
+    """
+
+    name: str
+    label: str
+    method: str
+    training: str | None = None
+    plate: str = FLAT
+    sees: Sees = "capture"
+    fabricated: bool = False
+    told: Literal["right", "drawn"] = "right"
+    paper: str | None = None
+
+
+TRAININGS = {
+    one.name: one
+    for one in (
+        Training("proposed"),
+        Training("no_inverse_filter", ("network.wiener=false",)),
+        Training("no_residual_block", ("network.refine=false",)),
+        Training("no_feature_extraction", ("network.features=false",)),
+        Training("sequential", ('train.freeze="optics"',)),
+        Training("conventional", ('train.camera="conventional"',)),
+        # The loss falls on the capture itself: a network that hands it through, and never learns.
+        Training("optics_only", ('train.freeze="network"', "network.wiener=false", 'train.mode="simultaneous"')),
+        Training(ROBUST, ('train.freeze="optics"',)),
+        Training("pyramid_deblurring", rival="pyramid_deblurring", plate="proposed"),
+        Training("plain_unet", rival="plain_unet", plate="proposed"),
+        Training("fourier_inpainting", rival="fourier_inpainting", plate=FLAT),
+        Training("two_stream_inpainting", rival="two_stream_inpainting", plate=FLAT),
+        Training("fence_removal", rival="fence_removal", plate=FLAT),
+        Training("attentive_drop_removal", rival="attentive_drop_removal", plate=FLAT),
+    )
+}
+
+
+def _network(name: str, label: str, paper: str | None = None) -> MethodRow:
+    return MethodRow(name, label, "network", name, name, paper=paper)
+
+
+def _after_plate(name: str, label: str, paper: str | None = None) -> MethodRow:
+    """A method behind the proposed plate that learns nothing, or whose name is a rival's."""
+    rival = name in TRAININGS
+    method = "rival" if rival else "as_seen" if name == "capture" else name
+    return MethodRow(name, label, method, name if rival else None, "proposed", paper=paper)
+
+
+TABLE_1 = (
+    _network("proposed", "Proposed", "proposed"),
+    _network("no_inverse_filter", "without inverse filter", "no_inverse_filter"),
+    _network("no_residual_block", "without residual block", "no_residual_block"),
+    _network("no_feature_extraction", "without feature extraction", "no_feature_extraction"),
+    _network("sequential", "optics first, network after", "sequential"),
+    _after_plate("pyramid_deblurring", "Pyramid network (after DeblurGAN-v2)", "pyramid_deblurring"),
+    _after_plate("plain_unet", "Plain U-Net", "plain_unet"),
+    _after_plate("richardson_lucy_far", "Richardson-Lucy, far PSF", "richardson_lucy_far"),
+    _after_plate("richardson_lucy_near", "Richardson-Lucy, near PSF"),
+    _after_plate("wiener_far", "Wiener, far PSF", "wiener_far"),
+    _after_plate("wiener_near", "Wiener, near PSF", "wiener_near"),
+    _after_plate("capture", "capture through the plate", "capture"),
+)
+
+
+def _inpainting(name: str, label: str, paper: str | None = None) -> tuple[MethodRow, MethodRow]:
+    """A method given the sharp scene around the hole, and the same given a conventional capture."""
+    trained = name in TRAININGS
+    method, training = ("rival", name) if trained else (name, None)
+    return (
+        MethodRow(name, f"{label}, given the scene", method, training, sees="scene", paper=paper),
+        MethodRow(f"{name}_of_capture", f"{label}, given the capture", method, training),
+    )
+
+
+_SPECIAL = {
+    "fence": MethodRow(
+        "fence_removal", "Fence removal (after DefenceNet)", "rival", "fence_removal", paper="fence_removal"
+    ),
+    "raindrop": MethodRow(
+        "attentive_drop_removal",
+        "Attentive drop removal (after AttentiveGAN)",
+        "rival",
+        "attentive_drop_removal",
+        paper="attentive_drop_removal",
+    ),
+}
+
+
+def _process_rows(training: str, label: str) -> tuple[MethodRow, MethodRow]:
+    """The plate of a training as fabricated, its network told the PSFs of this very plate, or those of the design."""
+    right = MethodRow(
+        f"{training}_fabricated",
+        f"{label}, as fabricated, PSFs measured",
+        "network",
+        training,
+        training,
+        "capture",
+        True,
+    )
+    wrong = MethodRow(
+        f"{training}_untold", f"{label}, as fabricated, PSFs of the design", "network", training, training, "capture",
+        True, "drawn",
+    )  # fmt: skip
+    return right, wrong
+
+
+def table_2(obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
+    """Rows of Table 2 for an obstruction.
+
+    Args:
+        obstruction: its name; fences and raindrops have a method of their own.
+        robust: whether there is a robust design to judge besides.
+    """
+    special = next((row for name, row in _SPECIAL.items() if name in obstruction), None)
+    return (
+        _network("proposed", "Proposed", "proposed"),
+        *_process_rows("proposed", "Proposed"),
+        *((_network(ROBUST, "Robust plate"), *_process_rows(ROBUST, "Robust plate")) if robust else ()),
+        MethodRow("optics_only", "optics alone: its capture", "as_seen", None, "optics_only", paper="optics_only"),
+        MethodRow("capture", "capture through the plate", "as_seen", None, "proposed", paper="capture"),
+        MethodRow("conventional_capture", "conventional capture", "as_seen", paper="conventional_capture"),
+        MethodRow("conventional_network", "conventional camera, same network", "network", "conventional"),
+        *_inpainting("fourier_inpainting", "Fourier inpainting (after LaMa)", "fourier_inpainting"),
+        *_inpainting("two_stream_inpainting", "Two-stream inpainting (after CTSDG)", "two_stream_inpainting"),
+        *((special,) if special else ()),
+        *_inpainting("biharmonic", "Biharmonic inpainting"),
+        *_inpainting("telea", "Telea inpainting"),
+        *_inpainting("navier_stokes", "Navier-Stokes inpainting"),
+    )
+
+
+def rows_of(table: int, obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
+    """Rows of Table 1 or 2; see `table_2`.
+
+    Raises:
+        InputError: another table.
+    """
+    if table == 1:
+        return TABLE_1
+    if table == 2:
+        return table_2(obstruction, robust=robust)
+    raise InputError("table", "must be 1 or 2, as in the paper", table, "Choose one of the two.")
+
+
+def trainings_of(rows: Sequence[MethodRow]) -> tuple[Training, ...]:
+    """Trainings that rows need, those first that others stand behind."""
+    asked = [row.training for row in rows if row.training] + [row.plate for row in rows if row.plate != FLAT]
+    needed: dict[str, Training] = {}
+
+    def add(name: str) -> None:
+        one = TRAININGS[name]
+        if one.plate not in (None, FLAT):
+            add(one.plate)
+        needed[name] = one
+
+    for name in asked:
+        add(name)
+    return tuple(needed.values())

@@ -1,0 +1,67 @@
+"""`write_report`: the page of a run, written once or as often as the run changes."""
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from doedesign.report.page.compare import compared
+from doedesign.report.page.files import work_state
+from doedesign.report.page.gather import gather
+from doedesign.report.page.render import render
+from fab.files import write_atomic
+
+_EVERY_S = 2.0
+
+
+def write_report(
+    run: str | Path,
+    *,
+    compare: Sequence[str | Path] = (),
+    order: str | Path | None = None,
+    out: str | Path | None = None,
+) -> Path:
+    """Write the page of a run: one HTML file that opens from the disk.
+
+    Args:
+        run: the run folder, finished or at work.
+        compare: other runs to put beside it.
+        order: its mask order; `masks/NAME` beside the folder of runs, or where the program runs, by default.
+        out: the file; report.html in the run's folder by default, comparison.html for several runs.
+
+    Returns:
+        the file.
+
+    Raises:
+        InputError: something that is damaged, was changed, or does not belong to the run.
+    """
+    folder = Path(run)
+    path = Path(out) if out is not None else folder / ("comparison.html" if compare else "report.html")
+    given = None if order is None else Path(order)
+    content = compared([folder, *map(Path, compare)]) if compare else gather(folder, given)
+    write_atomic(path, render(content))
+    return path
+
+
+def watch_report(
+    run: str | Path, *, order: str | Path | None = None, out: str | Path | None = None, every_s: float = _EVERY_S
+) -> Iterator[Path]:
+    """Write the page of a run whenever its files changed, until nothing in it is at work; yield it every time.
+
+    Args:
+        run: the run folder.
+        order: its mask order, as `write_report`.
+        out: the file, as `write_report`.
+        every_s: seconds between two looks.
+
+    Raises:
+        InputError: as `write_report`.
+    """
+    folder, seen = Path(run), None
+    while True:
+        working, state = work_state(folder)
+        if state != seen:
+            seen = state
+            yield write_report(folder, order=order, out=out)
+        if not working:
+            return
+        time.sleep(every_s)

@@ -1,0 +1,535 @@
+"""A larger aperture whose depth of field the plate buys back: what it is worth behind dirt, measured with its rivals.
+
+    python examples/wide_aperture.py [--images DIR ...] [--judged DIR ...] [--out runs/wide_aperture]
+
+Four cameras of 16 mm look at scenes from 2 m to infinity through dirt of 4 to 6 mm at 5 to 12 cm: stopped down to
+4.44 mm, at f/2, at f/1.4, and at f/1.4 with the plate of `wide_aperture.toml`. All expose as long, so that the stop
+gets 0.15 of the light. The dirt is known as one knows it in practice, with errors (`DirtErrors`): its light is taken
+off, what it keeps back is made up for, and a network gets the result and the share of light that passed. Everyone has
+the same network and training, on scenes of random depth that it is not told (it has the PSF of the middle depth),
+judged by PSNR of the covered part at 2 m, 4 m and infinity; the plate as drawn and as fabricated. Beside it stands one
+linear filter for all depths, without training. Written to OUT:
+
+    design/             the run of the plate
+    plates.json         what one filter for all depths leaves: plain lens, classic plates, the plate
+    CAMERA/             PSFs by parts of the aperture, light of the training scenes, network
+    scores.csv          PSNR of every picture, camera, depth and light
+    summary.json        means, differences picture by picture with their intervals
+    wide_aperture.png   pictures
+
+Light goes through the aperture part by part (`sim.imaging.parts`), for a shadow on a wide aperture changes its PSF.
+`doedesign train` is not used, for its scenes are mirrored at their edges and these shadows are wider than the pictures;
+network, loss and Adam's step are its own. Work that was stopped goes on with the same command.
+"""
+
+import argparse
+import csv
+import io
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import scipy.ndimage
+from dirty_scenes import DirtyScene, believed_shadow, corrected, dirty_scenes, light_of
+
+from doedesign.build import camera_from_spec
+from doedesign.capture.from_spec import obstruction_from_spec, sensor_from_spec
+from doedesign.capture.images import Pictures, picture_files, sample_files
+from doedesign.cli import exit_code
+from doedesign.design.design import Design
+from doedesign.design.objectives import PsfSet, filtered_error
+from doedesign.optimization import optimize
+from doedesign.recon.network import Network, NetworkShape
+from doedesign.recon.weights import camera_facts, read_network, write_network
+from doedesign.runs.level_maps import open_design
+from doedesign.runtime.progress import meter
+from doedesign.spec import Spec, load_spec
+from doedesign.spec.training import TrainSpec
+from doedesign.training.loss import adam_step, losses
+from doedesign.training.scores import mean_and_interval, paired_difference, psnr
+from fab.archive import read_archive, write_archive
+from fab.figure import SMALL, panels, save
+from fab.files import canonical_json, write_atomic
+from sim.camera import Camera
+from sim.imaging.filtering import common_filter, photograph_spectrum, transfers
+from sim.imaging.parts import ApertureParts, aperture_parts
+from sim.light import srgb_from_linear
+from sim.optic import CellOptic, HeightOptic
+from sim.psf_bank import psf
+from sim.sensor import Sensor, developed, expose
+
+SPEC = Path(__file__).parent / "wide_aperture.toml"
+DATA = Path(__file__).parents[2] / "shared" / "data"
+JUDGED_M = (2.0, 4.0, np.inf)
+DRAWS = 3  # plates as fabricated
+_AGAIN = "Remove it; it is computed again."
+
+
+class CameraKind(NamedTuple):
+    """A camera of the comparison: cells over its aperture, parts across, and whether it has the plate."""
+
+    name: str
+    aperture: str
+    samples: int
+    across: int
+    plate: bool = False
+
+
+CAMERAS = (
+    CameraKind("stop", "4.44 mm", 584, 3),
+    CameraKind("f2", "8 mm", 1053, 5),
+    CameraKind("open", "11.4 mm", 1500, 7),
+    CameraKind("plate", "11.4 mm", 1500, 7, plate=True),
+)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is computed.
+
+    Attributes:
+        size: pixels per side of a picture, a multiple of 8, at least 40.
+        scenes: scenes to train on.
+        judged: scenes to judge by.
+        steps: training steps.
+        batch: scenes per step.
+        width: features of the network's finest scale.
+        seed: of everything random.
+    """
+
+    size: int = 128
+    scenes: int = 160
+    judged: int = 32
+    steps: int = 600
+    batch: int = 2
+    width: int = 8
+    seed: int = 1
+
+
+def scenes_of(pictures: Pictures, plan: Plan, count: int, stream: int) -> list[DirtyScene]:
+    """Scenes behind the dirt of the spec; streams are apart."""
+    spec = load_spec(SPEC)
+    kind = obstruction_from_spec(spec, str(SPEC))
+    return list(dirty_scenes(pictures, camera_from_spec(spec), kind, plan.size, count, (plan.seed, stream)))
+
+
+def camera_of(kind: CameraKind) -> tuple[Camera, Spec]:
+    """The lens and sensor of a camera, with an odd window, and its spec."""
+    spec = load_spec(SPEC, [f"doe.samples={kind.samples}", f'doe.aperture="{kind.aperture}"'])
+    return replace(camera_from_spec(spec), window=spec.sensor.window | 1), spec
+
+
+class Bench:
+    """A camera of the comparison: its light by parts of the aperture at every depth, and its sensor.
+
+    Attributes:
+        kind: which camera.
+        camera: lens and sensor.
+        size: pixels per side of a picture, a multiple of 8, at least 40.
+        spec: its spec.
+    """
+
+    def __init__(self, kind: CameraKind, size: int, folder: Path, make: Any) -> None:
+        self.kind, self.size = kind, size
+        self.camera, self.spec = camera_of(kind)
+        self._make, self._folder = make, folder
+        self._kept: dict[float, tuple[ApertureParts, list[Any]]] = {}
+        self._filters: dict[int, np.ndarray] = {}
+        self._shadows: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
+
+    def at(self, depth_m: float) -> tuple[ApertureParts, list[Any]]:
+        """Parts of the PSF for a depth, and their transforms; computed once and kept in a file."""
+        if depth_m not in self._kept:
+            path = self._folder / f"parts_{depth_m:g}.npz"
+            if path.is_file():
+                _, arrays = read_archive(path, "parts of an aperture", _AGAIN)
+                parts = ApertureParts(arrays["psf"], arrays["centre_m"], arrays["side_m"], self.camera, depth_m)
+            else:
+                parts = aperture_parts(self._make(), depth_m, self.kind.across)
+                if not self.kind.plate:  # a lens without a plate has no faces of glass that reflect
+                    lost = [line.factor for line in self.camera.lines]
+                    parts = replace(parts, psf=parts.psf / np.array(lost, np.float32)[:, None, None])
+                self._folder.mkdir(parents=True, exist_ok=True)
+                arrays = {"psf": parts.psf, "centre_m": parts.centre_m, "side_m": parts.side_m}
+                write_archive(path, {"format": "parts of an aperture 1"}, arrays)
+            side = self.size + self.camera.window - 1
+            self._kept[depth_m] = parts, parts.otfs((side, side))
+        return self._kept[depth_m]
+
+    def corrected(self, light: np.ndarray, scene: DirtyScene, depth_m: float) -> np.ndarray:
+        """A capture with the believed dirt taken off (`corrected`), as this camera's PSFs for a depth say it."""
+        parts, key = self.at(depth_m)[0], (scene.key, depth_m)
+        if key not in self._shadows:
+            self._shadows[key] = believed_shadow(scene, parts, self.size)
+        return corrected(light, self._shadows[key], parts.whole.sum(axis=(1, 2)))
+
+    def sensor(self, brightness: float = 1.0) -> Sensor:
+        """The sensor after the same time for every camera: the widest aperture fills the stated share of its well."""
+        plain = sensor_from_spec(self.spec)
+        widest = max(camera_of(kind)[0].aperture_m for kind in CAMERAS)
+        return replace(plain, exposure=plain.exposure * brightness * (self.camera.aperture_m / widest) ** 2)
+
+    def filter(self, side: int) -> np.ndarray:
+        """The best linear filter for all depths, `[c, fy, fx]`, for pictures of an even `side`, in daylight."""
+        if side not in self._filters:
+            psfs = np.stack([self.at(depth)[0].whole for depth in depths_of(self.spec)], axis=1)
+            window = psfs.shape[-1]
+            wide = np.zeros((*psfs.shape[:2], side, side), np.float32)
+            wide[..., :window, :window] = psfs / psfs.sum(axis=(-2, -1), keepdims=True)
+            transfer = transfers(np.roll(wide, (side // 2 - window // 2,) * 2, axis=(-2, -1)))
+            # The middle of an even window lies half a pixel before the middle pixel of what was put there.
+            waves = np.fft.fftfreq(side)[:, None] + np.fft.rfftfreq(side)
+            white = float(self.sensor().white_e(3).mean())
+            # Half of a picture as bright as 0.3 of white passes.
+            variance = 0.3 / (0.5 * white) + (self.sensor().read_noise_e / (0.5 * white)) ** 2
+            transfer = transfer * np.exp(1j * np.pi * waves)
+            found = common_filter(transfer, photograph_spectrum(side, 0.05), variance / side**2)
+            self._filters[side] = np.array(found)
+            self._filters[side][..., 0, 0] = 1.0  # the mean is known
+        return self._filters[side]
+
+    def told(self) -> np.ndarray:
+        """PSFs that the network is told, those of the middle depth; nothing blurs the share that passed."""
+        whole = self.at(JUDGED_M[1])[0].whole
+        still = np.zeros_like(whole[:1])
+        still[0, whole.shape[1] // 2, whole.shape[2] // 2] = 1.0
+        # What is lost has been made up for.
+        return np.concatenate([whole / whole.sum(axis=(1, 2), keepdims=True), still])
+
+
+def taken(light: np.ndarray, sensor: Sensor, key: Any) -> np.ndarray:
+    """A developed capture of light, with noise."""
+    return np.asarray(developed(expose(jnp.asarray(light), sensor, key), sensor))
+
+
+def depths_of(spec: Spec) -> tuple[float, ...]:
+    """Depths of the scenes to train on."""
+    return tuple(spec.scene.far_m)
+
+
+def training_light(
+    bench: Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path
+) -> tuple[np.ndarray, list[float]]:
+    """Light of all scenes to train on, `[scene, c, y, x]`, and the depth of each; kept in a file."""
+    choose = np.random.default_rng((plan.seed, 9))
+    all_depths = depths_of(bench.spec)
+    depths = [all_depths[k] for k in choose.integers(len(all_depths), size=len(scenes))]
+    path = folder / "light.npz"
+    if path.is_file():
+        return read_archive(path, "light of scenes", _AGAIN)[1]["light"], depths
+    found = []
+    with meter(f"light, {bench.kind.name}", len(scenes), 0) as progress:
+        for number, (scene, depth) in enumerate(zip(scenes, depths, strict=True)):
+            found.append(light_of(scene, *bench.at(depth), plan.size))
+            progress.advance(number + 1, "")
+    light = np.stack(found)
+    write_archive(path, {"format": "light of scenes 1"}, {"light": light})
+    return light, depths
+
+
+@eqx.filter_jit
+def _slopes(network: Any, seen: Any, far: Any, wanted: Any, covered: Any, options: TrainSpec) -> Any:
+    moving, still = eqx.partition(network, eqx.is_inexact_array)
+
+    def loss(part: Any) -> Any:
+        picture = eqx.combine(part, still)(seen, far, far)[:, :3]
+        return losses(picture, wanted, covered, options)
+
+    return jax.value_and_grad(loss, has_aux=True)(moving)
+
+
+def trained(bench: Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path) -> Network:
+    """The network of a camera, trained or read."""
+    path = folder / "network.npz"
+    if path.is_file():
+        return read_network(path)[0]
+    light, depths = training_light(bench, scenes, plan, folder)
+    shape = NetworkShape(4, plan.width, 3, near_estimate=False)
+    network = Network.make(shape, plan.seed)
+    options = TrainSpec(l1=1.0, perceptual=0.0, masked=2.0)
+    moments = optax.scale_by_adam().init(eqx.filter(network, eqx.is_inexact_array))
+    far = np.repeat(bench.told()[None], plan.batch, axis=0)
+    rng = np.random.default_rng((plan.seed, 7))
+    sensor, edge = bench.sensor(), (bench.camera.window - 1) // 2
+    history = []
+    with meter(f"training, {bench.kind.name}", plan.steps, 0) as progress:
+        for step in range(plan.steps):
+            chosen = rng.integers(len(scenes), size=plan.batch)
+            keys = jax.random.split(jax.random.key(1000 + step), plan.batch)
+            seen, wanted, covered = [], [], []
+            for k, key in zip(chosen, keys, strict=True):
+                scene = scenes[k]
+                flip = int(rng.integers(2))  # every PSF here is even, but for errors of plates
+                images = (
+                    bench.corrected(taken(light[k], sensor, key), scene, depths[k]),
+                    srgb_from_linear(scene.background[:, edge:-edge, edge:-edge]),
+                    scene.covered,
+                )
+                for kept, image in zip((seen, wanted, covered), images, strict=True):
+                    kept.append(image[..., ::-1] if flip else image)
+            inputs = [np.stack(each).astype(np.float32) for each in (seen, wanted, covered)]
+            (value, _), slope = _slopes(network, inputs[0], far, inputs[1], inputs[2], options)
+            rate = 2e-3 * (0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / plan.steps))) * min(1, (step + 1) / 20)
+            moving, still = eqx.partition(network, eqx.is_inexact_array)
+            moving, moments = adam_step(moving, slope, moments, jnp.float32(rate))
+            network = eqx.combine(moving, still)
+            history.append(float(value))
+            progress.advance(step + 1, f"loss {np.mean(history[-50:]):.4f}")
+    colours = [colour.name for colour in bench.camera.colours]
+    about = camera_facts(bench.camera, (0.05, 0.12)) | {"colours": [*colours, "passed"], "history": history}
+    about["wavelengths_m"] = [*about["wavelengths_m"], 550e-9]
+    write_network(path, network, about)
+    return network
+
+
+@eqx.filter_jit
+def _look(network: Network, seen: Any, far: Any) -> Any:
+    return network(seen, far, far)[:, :3]
+
+
+def filtered(seen: np.ndarray, bench: Bench) -> np.ndarray:
+    """The classical way: holes filled from their surroundings, then one filter for all depths; display values."""
+    light, passed = seen[:3], seen[3]
+    weight = np.clip((passed - 0.1) / 0.3, 0.0, 1.0) + 1e-4
+    near = [scipy.ndimage.gaussian_filter(image, 6) for image in (*(light * weight), weight)]
+    light = weight * light + (1 - np.minimum(weight, 1)) * np.stack(near[:3]) / near[3]
+    mirrored = np.pad(light, ((0, 0), (0, light.shape[1]), (0, light.shape[2])), mode="symmetric")
+    side = mirrored.shape[-1]
+    sharp = np.fft.irfft2(np.fft.rfft2(mirrored) * bench.filter(side), (side, side))
+    return np.clip(srgb_from_linear(sharp[:, : light.shape[1], : light.shape[2]]), 0, 1).astype(np.float32)
+
+
+class Judged(NamedTuple):
+    """Score of a picture."""
+
+    camera: str
+    plate: str
+    way: str
+    light: float
+    depth_m: float
+    scene: int
+    psnr: float
+
+
+def judge(
+    bench: Bench,
+    network: Network,
+    scenes: Sequence[DirtyScene],
+    plan: Plan,
+    plate: str,
+    lights: Sequence[float],
+    at: Bench,
+) -> tuple[list[Judged], dict[Any, np.ndarray]]:
+    """Judge a camera; `at` has the PSFs that take the pictures, `bench` those that one knows of.
+
+    Returns the scores, and capture and reconstruction of every scene and depth in the first of `lights`.
+    """
+    rows, pictures = [], {}
+    edge, far = (bench.camera.window - 1) // 2, bench.told()[None]
+    with meter(f"judging, {bench.kind.name} {plate}", len(scenes), 0) as progress:
+        for number, scene in enumerate(scenes):
+            wanted = srgb_from_linear(scene.background[:, edge:-edge, edge:-edge])[None]
+            for depth in JUDGED_M:
+                light = light_of(scene, *at.at(depth), plan.size)
+                for brightness in lights:
+                    raw = taken(light, bench.sensor(brightness), jax.random.fold_in(jax.random.key(77), number))
+                    seen = bench.corrected(raw, scene, depth)
+                    found = {"network": np.asarray(_look(network, seen[None], far))[0], "filter": filtered(seen, bench)}
+                    for way, picture in found.items():
+                        value = float(psnr(picture[None], wanted, scene.covered[None])[0])
+                        rows.append(Judged(bench.kind.name, plate, way, brightness, depth, number, value))
+                    if brightness == lights[0]:
+                        shots = (np.clip(srgb_from_linear(raw), 0, 1), np.clip(found["network"], 0, 1))
+                        pictures[number, depth] = np.stack(shots)
+            progress.advance(number + 1, "")
+    return rows, pictures
+
+
+def classic_plates(design: Design, folder: Path) -> dict[str, Any]:
+    """Errors of one filter for all depths: plain lens, classic plates at their best strength, and the plate; a file."""
+    path = folder / "plates.json"
+    if path.is_file():
+        return json.loads(path.read_text())
+    tries = {
+        "plain": [("flat", {})],
+        "quartic": [("quartic", {"waves": w}) for w in (6.0, 7.4, 9.0, 12.0)],
+        "cubic": [("cubic", {"waves": w}) for w in (4.0, 8.0, 12.0)],
+        "logarithmic asphere": [
+            ("logarithmic_asphere", {"near": "2 m", "far": far}) for far in ("5 m", "10 m", "40 m")
+        ],
+    }
+    spec = load_spec(SPEC)
+    rows = {}
+    for name, starts in tries.items():
+        found = []
+        for start, options in starts:
+            # Zones of the asphere focus from 2 m on, so its lens is focused at infinity; its radii are those of rings.
+            words = ["optimize.steps=0", f'optimize.start="{start}"']
+            words += [] if start != "cubic" else ['optimize.parametrization="freeform"']
+            words += [] if start != "logarithmic_asphere" else ['sensor.defocus="0 um"']
+            own = load_spec(SPEC, words)
+            own = own.model_copy(
+                update={"optimize": own.optimize.model_copy(update={"start_options": _options(own, options)})}
+            )
+            found.append({"options": options} | errors_of(optimize(own), spec))
+        rows[name] = min(found, key=lambda row: row["worst"])
+    rows["plate"] = errors_of(design, spec)
+    write_atomic(path, canonical_json(rows))
+    return rows
+
+
+def _options(spec: Spec, options: Mapping[str, Any]) -> Any:
+    return type(spec.optimize.start_options)(tuple(sorted(options.items())))
+
+
+def errors_of(design: Design, spec: Spec) -> dict[str, float]:
+    """Mean and worst error of a design, as drawn, for all depths and for every depth's own filter."""
+    camera = replace(design.camera, window=spec.sensor.window)
+    height = design.nominal_height_m
+    far = psf(height, camera, depths_of(spec)).energy
+    view = PsfSet(jnp.zeros((3, 0, camera.window, camera.window)), jnp.asarray(far), jnp.zeros((3, 0)), camera)
+    options: dict[str, Any] = dict(spec.objectives[0].options)
+    return {
+        "mean": float(filtered_error(view, **options)),
+        "worst": float(filtered_error(replace(view, worst=True), **options)),
+        "known": float(filtered_error(view, known=True, **options)),
+    }
+
+
+def summary_of(rows: Sequence[Judged]) -> dict[str, Any]:
+    """Means by camera, plate, way, light and depth; worst depths; differences of the plate over every rival."""
+    table: dict[str, Any] = {}
+    by: dict[tuple[str, str, str, float], dict[float, dict[int, float]]] = {}
+    for row in rows:
+        by.setdefault(row[:4], {}).setdefault(row.depth_m, {})[row.scene] = row.psnr
+    worst = {}
+    for key, depths in by.items():
+        means = {depth: float(np.nanmean([*scores.values()])) for depth, scores in depths.items()}
+        last = min(means, key=means.__getitem__)
+        worst[key] = last
+        table[" / ".join(map(str, key))] = {f"{depth:g}": value for depth, value in means.items()} | {
+            "mean": float(np.mean([*means.values()])),
+            "worst": means[last],
+            "interval": list(mean_and_interval([*depths[last].values()])),
+        }
+    differences = {}
+    for key in by:
+        if key[0] != "plate":
+            continue
+        for rival in by:
+            if rival[0] == "plate" or rival[2:] != key[2:]:
+                continue
+            # Each at the depth that is worst for it, on the same pictures.
+            own, other = by[key][worst[key]], by[rival][worst[rival]]
+            pair = paired_difference([own[k] for k in sorted(own)], [other[k] for k in sorted(own)])
+            differences[f"{' / '.join(map(str, key))} over {rival[0]}"] = list(pair)
+    return {"scores": table, "worst depth, plate over rival": differences}
+
+
+def draw(path: Path, scenes: Sequence[DirtyScene], shown: Mapping[str, Mapping[Any, np.ndarray]], edge: int) -> None:
+    """Draw some scenes and their dirt, and every camera's capture and reconstruction, at infinity."""
+    chosen = range(min(3, len(scenes)))
+    note = "Scene at infinity, dirt of 4 to 6 mm; for each camera the capture, and what its network makes of it."
+    with panels(None, (1.5 * (2 + len(shown)), 3.1 * len(chosen)), "A wide aperture behind dirt", note) as figure:
+        grid = figure.subplots(2 * len(chosen), 1 + len(shown))
+        for row, number in enumerate(chosen):
+            scene = scenes[number]
+            wanted = srgb_from_linear(scene.background[:, edge:-edge, edge:-edge])
+            columns = [("scene", wanted, "covered", np.broadcast_to(1 - scene.covered, wanted.shape))]
+            for name, pictures in shown.items():
+                raw, found = pictures[number, np.inf]
+                value = float(psnr(found[None], wanted[None], scene.covered[None])[0])
+                columns.append((name, raw, f"{value:.1f} dB", found))
+            for column, (above, first, below, second) in enumerate(columns):
+                for line, words, image in ((0, above, first), (1, below, second)):
+                    axes = grid[2 * row + line, column]
+                    axes.imshow(np.clip(image, 0, 1).transpose(1, 2, 0), origin="lower")
+                    axes.set_axis_off()
+                    axes.set_title(words, fontsize=SMALL)
+    save(figure, path)
+
+
+def run(out: Path, plan: Plan, images: Sequence[Path], judged: Sequence[Path]) -> dict[str, Any]:
+    """Design, train and judge; return the summary."""
+    out.mkdir(parents=True, exist_ok=True)
+    optimize(SPEC, out / "design")
+    design = open_design(out / "design")
+    classic_plates(design, out)
+    pools = [Pictures(tuple(files), 512) for files in (images, judged)]
+    training = scenes_of(pools[0], plan, plan.scenes, 0)
+    seen = scenes_of(pools[1], plan, plan.judged, 1)
+    rows: list[Judged] = []
+    shown: dict[str, dict[Any, np.ndarray]] = {}
+    edge = 0
+    for kind in CAMERAS:
+        folder = out / kind.name
+        drawn = partial(_drawn, kind, design)
+        bench = Bench(kind, plan.size, folder, drawn)
+        network = trained(bench, training, plan, folder)
+        edge = (bench.camera.window - 1) // 2
+        found, shown[kind.name] = judge(bench, network, seen, plan, "drawn", (1.0, 0.1), bench)
+        rows += found
+        for number in range(DRAWS if kind.plate else 0):
+            made = Bench(kind, plan.size, folder / f"draw_{number}", partial(_fabricated, kind, design, number))
+            found, shown["plate, fabricated"] = judge(bench, network, seen, plan, f"fabricated {number}", (1.0,), made)
+            rows += found
+        write_scores(out / "scores.csv", rows)
+    found = summary_of(rows)
+    write_atomic(out / "summary.json", canonical_json(found))
+    draw(out / "wide_aperture.png", seen, shown, edge)
+    return found
+
+
+def _drawn(kind: CameraKind, design: Design) -> CellOptic:
+    camera, _ = camera_of(kind)
+    return HeightOptic.of(camera, design.level_map.height_m if kind.plate else None)
+
+
+def _fabricated(kind: CameraKind, design: Design, number: int) -> CellOptic:
+    camera, spec = camera_of(kind)
+    return replace(design, camera=camera).fabricated(
+        seed=0, draw=f"normal/{number}", depths=(min(depths_of(spec)), np.inf)
+    )
+
+
+def write_scores(path: Path, rows: Sequence[Judged]) -> None:
+    """Write the scores of all pictures."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Judged._fields)
+    writer.writerows([*row[:-1], f"{row.psnr:.4f}"] for row in rows)
+    write_atomic(path, text.getvalue().encode())
+
+
+def main() -> int:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--images", type=Path, nargs="*", help="folders to train on; scikit-image's pictures if none")
+    parser.add_argument("--judged", type=Path, nargs="*", help="folders to judge by; scikit-image's last two if none")
+    for name in ("size", "scenes", "judged-scenes", "steps", "batch", "width"):
+        field = "judged" if name == "judged-scenes" else name
+        parser.add_argument(f"--{name}", type=int, default=getattr(Plan(), field), dest=f"plan_{field}")
+    parser.add_argument("--out", type=Path, default=Path("runs/wide_aperture"))
+    given = parser.parse_args()
+
+    def work() -> None:
+        samples = list(sample_files())
+        images = [file for folder in given.images or () for file in picture_files(folder)] or samples[:-2]
+        judged = [file for folder in given.judged or () for file in picture_files(folder)] or samples[-2:]
+        plan = Plan(**{key[5:]: value for key, value in vars(given).items() if key.startswith("plan_")})
+        print(json.dumps(run(given.out, plan, images, judged), indent=1))
+
+    return exit_code(work)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

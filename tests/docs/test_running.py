@@ -1,0 +1,153 @@
+"""Every code block of README and documentation runs; the site builds strictly and fetches nothing from elsewhere."""
+
+import contextlib
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from skimage import data
+
+from doedesign.cli import main
+from doedesign.templates import template_names, template_text
+from tests.docs.pages import ROOT, blocks
+
+pytestmark = pytest.mark.slow
+
+# Pages whose commands run, a folder for each row: later pages go on with the runs of earlier ones.
+SESSIONS = (
+    ("docs/start.md", "README.md"),
+    (
+        "docs/tutorial.md",
+        "docs/commands/design.md",
+        "docs/commands/light.md",
+        "docs/commands/fabrication.md",
+        "docs/commands/network.md",
+        "docs/commands/looking.md",
+        "docs/klayout.md",
+        "docs/notebooks.md",
+    ),
+    ("docs/tasks/spots.md",),
+    ("docs/tasks/areas.md",),
+    ("docs/tasks/foci.md",),
+    ("docs/tasks/see-through.md",),
+    ("docs/tasks/hdr.md", "docs/tasks/wide-aperture.md"),
+)
+# What a full design of a template or a training takes minutes for is cut short; the command is otherwise as it stands.
+SHORT = {
+    "optimize": ["--set", "optimize.steps=2"],
+    "train": ["--set", "train.steps=2"],
+    "examples/snapshot_hdr.py": ["--scenes", "1", "--others", "1", "--case", "without lamps"],
+    "examples/snapshot_hdr_network.py": ["--scenes", "1", "--examples", "2", "--steps", "2"],
+}
+LONG = ("examples/snapshot_hdr", "examples/wide_aperture")
+PROGRAMS = {"make", "pip", ".", ".ci/run"}  # make and what installs run in tests of their own
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder like the root of the repository, with what a reader has: pictures, a height map."""
+    made = tmp_path / "documentation"
+    made.mkdir()
+    shutil.copytree(ROOT / "examples", made / "examples")
+    shutil.copytree(ROOT / "masks" / "released", made / "masks" / "released")
+    for number, name in enumerate(("chelsea", "astronaut", "coffee", "rocket")):
+        picture = getattr(data, name)()
+        for pictures, shown in (("pictures", picture), ("others", picture[::-1]))[: 1 + number // 2]:
+            (made / pictures).mkdir(exist_ok=True)
+            Image.fromarray(shown).save(made / pictures / f"{name}.png")
+    y, x = np.indices((1101, 1101)) - 550
+    np.save(made / "height.npy", np.float32(600e-9) * ((x**2 + y**2) % 8100 / 8100).astype(np.float32))
+    return made
+
+
+def test_every_page_with_commands_runs():
+    """No page is forgotten: its commands run, or a comment above each block says why not."""
+    left_out = {block.page for block in blocks("sh") if block.runs} - {page for pages in SESSIONS for page in pages}
+    # CONTRIBUTING.md has targets of make, and digests of whole sessions.
+    assert left_out <= {"CONTRIBUTING.md"}
+
+
+@pytest.mark.parametrize("pages", SESSIONS, ids=lambda pages: pages[0])
+def test_commands_run(pages: tuple[str, ...], folder: Path):
+    found = [(page, block) for page in pages for block in blocks("sh") if block.page == page and block.runs]
+    lines = dict.fromkeys(line for _, block in found for line in block.lines)  # what two pages have runs once
+    for line in lines:
+        words = shlex.split(line)
+        if words[0] == "doedesign" and words[1:] != ["--version"]:
+            takes_long = words[1] == "train" or (words[1] == "optimize" and takes_steps(words[2].removesuffix(".toml")))
+            short = SHORT[words[1]] if takes_long else []
+            with contextlib.chdir(folder):
+                assert main(words[1:] + short) == 0, line
+        elif words[:3] == ["python", "-m", "pip"]:
+            pass  # in a test of the release
+        elif words[0] == "jupytext":
+            subprocess.run([sys.executable, "-m", *words], cwd=folder, env=environment(), check=True)
+        elif words[0] == "python":
+            command = [sys.executable, *words[1:], *SHORT.get(words[1], [])]
+            subprocess.run(command, cwd=folder, env=environment(), check=True)
+        elif words[0] in ("mkdir", "cp"):
+            subprocess.run(words, cwd=folder, check=True)
+        else:
+            assert words[0] in PROGRAMS or words[1:] == ["--version"], line
+
+
+@pytest.mark.parametrize("page", sorted({block.page for block in blocks("python") if block.page != "CONTRIBUTING.md"}))
+def test_python_of_a_page_runs(page: str, tmp_path: Path):
+    """The blocks of a page one after another, in a process of their own (CONTRIBUTING.md: test_additions.py)."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    Image.fromarray(data.chelsea()).save(tmp_path / "cat.jpg")
+    program = "\n".join(block.text for block in blocks("python") if block.page == page)
+    # Workers of a study import the main program, so it has to know that it is one.
+    indented = "".join(f"    {line}\n" for line in program.splitlines())
+    (tmp_path / "session.py").write_text(f'if __name__ == "__main__":\n{indented}')
+    done = subprocess.run(
+        [sys.executable, "session.py"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    if page == "docs/notebooks.md":
+        assert (tmp_path / "masks" / "quick" / "manifest.json").is_file()
+
+
+def test_the_site_builds_strictly_and_fetches_nothing(tmp_path: Path):
+    """No warning, and no address of another server in anything that a page loads."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        env={**environment(), "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > 25
+    for page in pages:
+        text = page.read_text("utf-8")
+        loaded = re.findall(r"<(?:script|img|iframe|link)\b[^>]*?\b(?:src|href)=[\"']?((?:https?:)?//[^\"'> ]+)", text)
+        assert not loaded, page
+    for sheet in (tmp_path / "site").rglob("*.css"):
+        assert not re.findall(r"(?:url\(|@import )[\"']?(?:https?:)?//", sheet.read_text("utf-8")), sheet
+
+
+def takes_steps(name: str) -> bool:
+    """Whether a spec takes many steps; some classic plates are given by a formula."""
+    return name in LONG or (name in template_names() and bool(re.search(r"(?m)^steps = [1-9]", template_text(name))))
+
+
+def environment() -> dict[str, str]:
+    """The environment of a process that finds the packages of this tree."""
+    return {**os.environ, "PYTHONPATH": str(ROOT)}

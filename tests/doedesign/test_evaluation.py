@@ -1,0 +1,496 @@
+"""`doedesign evaluate`: the same pairs for everybody, methods as published, intervals, and other people's programs."""
+
+import csv
+import io
+import json
+import shutil
+import sys
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from skimage import data, restoration
+
+import doedesign.evaluation.evaluate as evaluate_module
+from doedesign.calibration.measurement import load_measurement
+from doedesign.capture.images import sample_files
+from doedesign.evaluation.candidates import candidates_of
+from doedesign.evaluation.evaluate import evaluate
+from doedesign.evaluation.external import ExternalMethod
+from doedesign.evaluation.methods import METHODS, MethodInputs, as_seen
+from doedesign.evaluation.pairs import PairSet
+from doedesign.evaluation.plates import PlateBanks
+from doedesign.evaluation.published import TABLE_1, TABLE_2
+from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow, rows_of, trainings_of
+from doedesign.evaluation.statistics import bootstrap_mean
+from doedesign.evaluation.trainings import TrainingPlan
+from doedesign.recon.weights import NETWORK_NAME
+from doedesign.runs.folder import TRAINING_TABLES
+from doedesign.runs.level_maps import open_design
+from doedesign.spec import load_spec
+from doedesign.spec.values.table import SpecTable
+from fab.errors import InputError
+from sim.light import linear_from_srgb, srgb_from_linear
+from sim.optic import HeightOptic
+from sim.psf_bank import PsfBank, psf
+from sim.sensor import Sensor
+from tests.doedesign import small_runs
+from tests.doedesign.local_cluster import Cluster
+from tests.doedesign.small_runs import call, finished_run
+
+# A camera of three colours before dirt, and a network that is trained in moments.
+SPEC = (
+    small_runs.SPEC.replace('["550 nm"]', '["656 nm", "589 nm", "486 nm"]')
+    .replace('near = ["6 mm"]\nfar = ["inf"]', 'near = ["6 mm", "9 mm"]\nfar = ["0.6 m"]\nocclusion = "paper"')
+    .partition("[[limit]]")[0]
+    + """
+[obstruction]
+kind = "dirt"
+[network]
+width = 3
+depth = 1
+[train]
+size = 32
+steps = 2
+perceptual = 0.0
+validation = 2
+validate_every = 2
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return finished_run(tmp_path_factory.mktemp("small"), SPEC)
+
+
+@pytest.fixture(scope="module")
+def pairs(run: Path) -> PairSet:
+    return PairSet.of(load_spec(run / "spec.toml"), "spec.toml", sample_files()[:3])
+
+
+# Statistics.
+
+
+def test_an_interval_of_independent_pictures_is_the_textbooks(rng: np.random.Generator):
+    values = rng.normal(20, 3, (1, 400))
+    found = bootstrap_mean(values, [f"{k}" for k in range(400)])
+    assert found is not None
+    width = 2 * 1.96 * values.std(ddof=1) / np.sqrt(400)
+    # 2000 resamples: a quantile near 2.5 % is known to 3 % of the width.
+    assert found.high - found.low == pytest.approx(width, rel=0.1)
+    assert found.mean == pytest.approx(values.mean())
+    assert (found.pairs, found.pictures, found.seeds) == (400, 400, 1)
+
+
+def test_many_pairs_of_one_photograph_prove_no_more_than_one(rng: np.random.Generator):
+    once = rng.normal(20, 3, (1, 30))
+    names = [f"{k}" for k in range(30)]
+    alone, often = bootstrap_mean(once, names), bootstrap_mean(np.repeat(once, 9, axis=1), np.repeat(names, 9).tolist())
+    assert alone is not None
+    assert often is not None
+    assert often[:3] == pytest.approx(alone[:3])
+    assert often.pairs == 9 * alone.pairs
+
+
+def test_seeds_are_drawn_again_too(rng: np.random.Generator):
+    """Two seeds that differ by much: however many pairs there are, the interval holds both."""
+    values = rng.normal(0, 0.01, (2, 50)) + np.array([[20.0], [22.0]])
+    found = bootstrap_mean(values, [f"{k}" for k in range(50)])
+    assert found is not None
+    assert found.low == pytest.approx(20, abs=0.02)
+    assert found.high == pytest.approx(22, abs=0.02)
+    assert found.mean == pytest.approx(21, abs=0.02)
+
+
+def test_a_pair_without_a_score_does_not_count():
+    values = np.array([[1.0, np.nan, 3.0]])
+    found = bootstrap_mean(values, ["a", "b", "c"])
+    assert found is not None
+    assert (found.mean, found.pairs) == (2.0, 2)
+    assert bootstrap_mean(np.array([[np.nan]]), ["a"]) is None
+    with pytest.raises(ValueError, match="finite"):
+        bootstrap_mean(np.array([[np.inf]]), ["a"])
+    with pytest.raises(ValueError, match="one per pair"):
+        bootstrap_mean(values, ["a"])
+
+
+# Pairs.
+
+
+def test_a_pair_follows_from_the_seed_and_its_number(run: Path, pairs: PairSet):
+    again = PairSet.of(load_spec(run / "spec.toml"), "spec.toml", sample_files()[:3])
+    later = again.scene(5)
+    for one, other in zip(_leaves(pairs.scene(5).scene), _leaves(later.scene), strict=True):
+        assert np.array_equal(one, other)
+    assert pairs.scene(5).name == later.name
+    moved = PairSet.of(load_spec(run / "spec.toml"), "spec.toml", sample_files()[:3], seed=1)
+    assert not np.array_equal(moved.scene(5).scene.background, later.scene.background)
+
+
+def test_depths_are_those_whose_psfs_are_known(pairs: PairSet):
+    depths = [pairs.depths(k) for k in range(40)]
+    assert {d.near_m for d in depths} == set(pairs.near_m)  # all eight, in forty pairs
+    assert min(pairs.near_m) == pytest.approx(6e-3)
+    assert max(pairs.near_m) == pytest.approx(9e-3)
+    # Evenly in 1/z.
+    assert np.diff(1 / np.array(sorted(pairs.near_m))) == pytest.approx(np.full(7, (1 / 9e-3 - 1 / 6e-3) / 7))
+    for number in range(8):
+        scene = pairs.scene(number).scene
+        assert float(scene.obstructions[0].depth_m) == pytest.approx(depths[number].near_m)
+        assert float(scene.background_depth_m) == pytest.approx(depths[number].far_m)
+
+
+@pytest.mark.slow
+def test_a_capture_lies_on_its_scene(pairs: PairSet):
+    """Far from the obstruction a plain lens shows the scene itself, blurred by its own spot alone."""
+    camera = pairs.model.camera
+    bank = psf(HeightOptic.of(camera), camera, pairs.depths_m)
+    number = min(range(12), key=lambda k: float(pairs.shown(pairs.scene(k))[1].mean()))
+    scene = pairs.scene(number)
+    capture, (clean, mask) = pairs.photographed(number, scene, bank), pairs.shown(scene)
+    assert capture.shape == clean.shape == (3, pairs.size, pairs.size)
+    assert mask.shape == clean.shape[1:]
+    free = mask < 0.01
+    # The best shift of the capture against the scene is none.
+    shifts = {(dy, dx): np.roll(capture, (dy, dx), (1, 2)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)}
+    scaled = {at: image * (clean * image)[:, free].sum() / (image**2)[:, free].sum() for at, image in shifts.items()}
+    errors = {at: float(np.mean((image - clean)[:, free] ** 2)) for at, image in scaled.items()}
+    assert min(errors, key=lambda at: errors[at]) == (0, 0)
+
+
+def _leaves(value: Any) -> list[np.ndarray]:
+    if is_dataclass(value):
+        return [leaf for one in fields(value) for leaf in _leaves(getattr(value, one.name))]
+    if isinstance(value, tuple):
+        return [leaf for one in value for leaf in _leaves(one)]
+    return [np.asarray(value)]
+
+
+# Methods.
+
+
+@pytest.fixture
+def inputs(rng: np.random.Generator) -> MethodInputs:
+    light = linear_from_srgb((data.astronaut()[64:128, 64:128] / 255).astype(np.float32).transpose(2, 0, 1))
+    y, x = np.mgrid[-5:6, -5:6]
+    blob = np.exp(-(x**2 + y**2) / 6).astype(np.float32)
+    psfs = np.stack([0.8 * blob / blob.sum()] * 3)
+    mask = np.zeros((64, 64), np.float32)
+    mask[20:30, 25:40] = 1
+    return MethodInputs(light, psfs, psfs[:, ::-1], mask, Sensor())
+
+
+@pytest.mark.parametrize("name", ["wiener_far", "wiener_near", "richardson_lucy_far", "richardson_lucy_near"])
+def test_deconvolution_without_a_blur_is_the_capture(inputs: MethodInputs, name: str):
+    point = np.zeros((3, 5, 5), np.float32)
+    point[:, 2, 2] = 1
+    found = METHODS[name](inputs._replace(far=point, near=point))
+    # The Wiener filter damps noise by a thousandth or so.
+    assert np.abs(found - as_seen(inputs)).max() < 0.02
+
+
+def test_deconvolution_is_scikit_images(inputs: MethodInputs):
+    """In one channel, called as its manual shows; the PSF of unit energy, the light divided by the rest."""
+    wide = np.pad(inputs.light[1].astype(float) / inputs.far[1].sum(), 15, mode="symmetric")
+    unit = inputs.far[1].astype(float) / inputs.far[1].sum()
+    direct = restoration.richardson_lucy(wide, unit, num_iter=30, clip=False, filter_epsilon=1e-6)[15:-15, 15:-15]
+    found = METHODS["richardson_lucy_far"](inputs)[1]
+    assert np.abs(found - srgb_from_linear(direct.astype(np.float32))).max() < 1e-4  # single precision
+
+
+def test_deconvolution_brings_lost_light_back(inputs: MethodInputs):
+    even = inputs._replace(light=np.full((3, 32, 32), 0.4, np.float32))  # of 0.5: the PSF loses a fifth
+    for name in ("wiener_far", "richardson_lucy_far"):
+        assert METHODS[name](even) == pytest.approx(float(srgb_from_linear(np.full(1, 0.5))[0]), abs=8e-3)  # 1 %
+
+
+@pytest.mark.parametrize("name", ["biharmonic", "telea", "navier_stokes"])
+def test_inpainting_fills_the_hole_and_leaves_the_rest(inputs: MethodInputs, name: str):
+    if name != "biharmonic":
+        pytest.importorskip("cv2")
+    found, before = METHODS[name](inputs), as_seen(inputs)
+    hole = inputs.mask >= 0.5
+    assert np.abs(found - before)[:, ~hole].max() <= 0.5 / 255 + 1e-6  # of eight bits
+    assert np.abs(found - before)[:, hole].max() > 0.02
+    # Of an even picture nothing is hidden.
+    even = inputs._replace(light=np.where(hole, 0, 0.25).astype(np.float32) * np.ones((3, 1, 1), np.float32))
+    assert np.abs(METHODS[name](even) - srgb_from_linear(np.full(1, 0.25))).max() < 0.01
+
+
+# Rows.
+
+
+def test_every_row_of_the_paper_has_one_of_ours():
+    assert {row.paper for row in rows_of(1, "dirt") if row.paper} == set(TABLE_1)
+    for obstruction, published in TABLE_2.items():
+        assert {row.paper for row in rows_of(2, obstruction) if row.paper} == set(published)
+    with pytest.raises(InputError, match="must be 1 or 2"):
+        rows_of(3, "dirt")
+
+
+def test_rows_are_named_once_and_their_trainings_are_known():
+    for rows in (rows_of(1, "dirt"), rows_of(2, "fence", robust=True), rows_of(2, "raindrop")):
+        assert len({row.name for row in rows}) == len(rows)
+        needed = [one.name for one in trainings_of(rows)]
+        assert len(set(needed)) == len(needed)
+        for row in rows:
+            assert row.plate == FLAT or row.plate in needed
+            assert row.training is None or row.training in needed
+            assert row.method in {*METHODS, "network", "rival"}
+        for name in needed:  # a plate is there before the network behind it
+            plate = TRAININGS[name].plate
+            assert plate in (None, FLAT) or needed.index(plate) < needed.index(name)
+
+
+def test_changes_of_trainings_are_changes_that_a_spec_takes(run: Path):
+    for one in TRAININGS.values():
+        spec = open_design(run, False, overrides=one.changes, free=TRAINING_TABLES).spec
+        assert isinstance(spec, SpecTable)
+
+
+def test_a_network_is_not_judged_by_what_it_was_trained_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Nor by a plate as fabricated where its process makes none; both rows say so."""
+    judged_by = sample_files()[:1]
+    row = next(one for one in rows_of(2, "dirt") if one.name == "proposed")
+    made = MethodRow("proposed_fabricated", "", "network", "proposed", "proposed", fabricated=True)
+    plan = TrainingPlan(run, tmp_path, "paper", "dirt")
+    about = {"pictures": {"training": ["other.png", f"sub/{judged_by[0].name}"]}}
+    (plan.folder(TRAININGS["proposed"], 0)).mkdir(parents=True)
+    (plan.folder(TRAININGS["proposed"], 0) / NETWORK_NAME).write_bytes(b"")
+    monkeypatch.setattr("doedesign.evaluation.candidates.read_network", lambda _: (None, about))
+    bank = PsfBank(np.ones((1, 1, 3, 3), np.float32), ("green",), (1.0,), 1e-6)
+    plates = {"proposed@0": PlateBanks(bank, why_none="no errors")}
+    ready, left = candidates_of((row, made), plan, (0,), {}, plates, judged_by)
+    assert ready == ()
+    assert [one.why for one in left] == [
+        f"trained on {judged_by[0].name}, which is among the pictures to judge by",
+        "no errors",
+    ]
+    ready, left = candidates_of((row,), plan, (0,), {}, plates, sample_files()[1:])
+    assert [one.row for one in ready] == [row]
+    assert left == ()
+
+
+# Programs of other people.
+
+COPY = """
+import shutil, sys
+from pathlib import Path
+given, found = map(Path, sys.argv[1:])
+for path in given.glob("*.png"):
+    if "mask" not in path.name:
+        shutil.copy(path, found / path.name)
+"""
+
+
+@pytest.fixture
+def copies(tmp_path: Path) -> str:
+    (tmp_path / "copy.py").write_text(COPY)
+    return f"{sys.executable} {tmp_path / 'copy.py'} {{in}} {{out}}"
+
+
+def scores_by_row(out: Path, name: str = "table2-dirt-paper") -> dict[str, dict[str, float]]:
+    rows = csv.DictReader(io.StringIO((out / name / "table.csv").read_text()))
+    found: dict[str, dict[str, float]] = {}
+    for row in rows:
+        if row["mean"]:
+            found.setdefault(row["row"], {})[f"{row['region']} {row['score']}"] = float(row["mean"])
+    return found
+
+
+@pytest.mark.slow
+def test_a_program_that_copies_scores_as_the_capture_does(run: Path, copies: str, tmp_path: Path):
+    out = tmp_path / "out"
+    table = evaluate(run, out, pairs=4, methods=[f"copy={copies}", f"hole:scene={copies}"], workers=0)
+    found = scores_by_row(out)
+    # Eight bits: an error of a two hundred and fiftieth at most beside errors of a tenth.
+    assert found["copy"] == pytest.approx(found["conventional_capture"], rel=2e-3)
+    assert found["hole"]["occluded psnr"] < found["conventional_capture"]["full psnr"]
+    # Nothing is trained, and the table says so.
+    assert {one.row.name for one in table.rows if one.why} >= {"proposed", "conventional_network", "optics_only"}
+    assert "not trained for seed 0" in table.text()
+    # All is there, so the program is not asked again.
+    (tmp_path / "copy.py").write_text("raise SystemExit(3)")
+    again = evaluate(run, out, pairs=4, methods=[f"copy={copies}", f"hole:scene={copies}"], workers=0)
+    assert again.json() == table.json()
+    with pytest.raises(InputError, match=r"method copy.*exit code 3"):
+        evaluate(run, out, pairs=5, methods=[f"copy={copies}"], workers=0)
+
+
+def test_a_program_has_a_name_of_its_own(run: Path, copies: str, tmp_path: Path):
+    for methods in ([f"capture={copies}"], [f"copy={copies}", f"copy:scene={copies}"]):
+        with pytest.raises(InputError, match="must have a name of its own"):
+            evaluate(run, tmp_path / "out", pairs=1, methods=methods, workers=0)
+
+
+def test_what_a_program_left_behind_is_not_taken_for_an_answer(run: Path, copies: str, tmp_path: Path):
+    """Another command under the same name that writes nothing: pictures of the first one are gone."""
+    evaluate(run, tmp_path / "out", pairs=2, methods=[f"copy={copies}"], workers=0)
+    with pytest.raises(InputError, match=r"must write 0000.png for every pair"):
+        evaluate(run, tmp_path / "out", pairs=2, methods=[f"copy={sys.executable} -c pass {{in}} {{out}}"], workers=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("lama", "a name and a command"),
+        ("=x {in} {out}", "a name and a command"),
+        ("a/b=x {in} {out}", "a name and a command"),
+        ("lama:sharp=x {in} {out}", "what it sees must be one of"),
+        ("lama=x {in}", "must name the folder {out}"),
+        ("lama=x '{in} {out}", "must be a command line"),
+    ],
+)
+def test_a_wrong_program_is_refused_before_anything_is_computed(run: Path, tmp_path: Path, text: str, words: str):
+    with pytest.raises(InputError, match=words):
+        evaluate(run, tmp_path / "out", methods=[text])
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unfinished_robust_design_is_refused_before_anything_is_trained(run: Path, tmp_path: Path):
+    robust = tmp_path / "robust"
+    shutil.copytree(run, robust)
+    (robust / "level_map.npz").unlink()
+    with pytest.raises(InputError, match="robust"):
+        evaluate(run, tmp_path / "out", robust=robust, train=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_program_is_found_out(run: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="must be a program that can be run"):
+        evaluate(run, out, pairs=2, methods=["x=/nowhere/x {in} {out}"], workers=0)
+    with pytest.raises(InputError, match=r"must write 0000.png for every pair"):
+        evaluate(run, out, pairs=2, methods=[f"x={sys.executable} -c pass {{in}} {{out}}"], workers=0)
+    small = (
+        "import sys,imageio,numpy;[imageio.imwrite(f'{sys.argv[2]}/000{k}.png',numpy.zeros((8,8,3),'u1'))for k in(0,1)]"
+    )
+    with pytest.raises(InputError, match="must keep the size of 32 x 32 pixels"):
+        evaluate(run, out, pairs=1, methods=[f'x={sys.executable} -c "{small}" {{in}} {{out}}'], workers=0)
+
+
+def test_a_command_line_is_not_a_shell():
+    one = ExternalMethod.parse("x=echo {in};ls $HOME {out}")
+    assert one.command == ("echo", "{in};ls", "$HOME", "{out}")
+
+
+# The command.
+
+
+@pytest.mark.slow
+def test_stopped_and_gone_on_with_it_ends_the_same(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    whole = evaluate(run, tmp_path / "whole", pairs=4, workers=0)
+    stop_after, done = 2, []
+    original = evaluate_module.evaluate_here
+
+    def stopped(*given: Any, **options: Any):
+        for item in original(*given, **options):
+            if len(done) == stop_after:
+                raise KeyboardInterrupt
+            done.append(item)
+            yield item
+
+    monkeypatch.setattr(evaluate_module, "evaluate_here", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(run, tmp_path / "parts", pairs=4, workers=0)
+    kept = (tmp_path / "parts/table2-dirt-paper/scores.jsonl").read_text().splitlines()
+    assert len({json.loads(line)["key"].rpartition("/")[2] for line in kept}) == stop_after
+    asked: list[Any] = []
+
+    def counted(*given: Any, **options: Any):
+        for item in original(*given, **options):
+            asked.append(item)
+            yield item
+
+    monkeypatch.setattr(evaluate_module, "evaluate_here", counted)
+    rest = evaluate(run, tmp_path / "parts", pairs=4, workers=0)
+    assert len(asked) == 4 - stop_after
+    assert rest.json() == whole.json()
+    for name in ("table.csv", "table.json", "table.tex", "pairs.csv", "pictures.png"):
+        one, other = (tmp_path / part / "table2-dirt-paper" / name for part in ("whole", "parts"))
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_another_question_needs_another_folder(run: Path, tmp_path: Path):
+    evaluate(run, tmp_path / "out", pairs=1, workers=0)
+    with pytest.raises(InputError, match=r"one with another .*seed"):
+        evaluate(run, tmp_path / "out", pairs=1, seed=1, workers=0)
+
+
+@pytest.mark.slow
+def test_networks_are_trained_scored_and_kept(run: Path, tmp_path: Path):
+    """Every network of the two tables, at a size that says nothing: it is there, and scored."""
+    out = tmp_path / "out"
+    rows = tuple(row for table in (1, 2) for row in rows_of(table, "dirt"))
+    own = {row.name for row in rows if row.method == "network"}
+    for table in (1, 2):
+        evaluate(run, out, table=table, pairs=3, train=True, workers=0, draws=2)
+    found = scores_by_row(out, "table1-dirt-paper") | scores_by_row(out)
+    assert own <= set(found)
+    told = json.loads((out / "table2-dirt-paper" / "table.json").read_text())
+    by_name = {row["name"]: row for row in told["rows"]}
+    assert by_name["proposed_fabricated"]["gain_over_proposed"]["full"]["psnr"]["mean"] != 0
+    assert by_name["proposed"]["paper"]["psnr"] == TABLE_2["dirt"]["proposed"].psnr
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_table_of_this_machine(run: Path, tmp_path: Path):
+    pytest.importorskip("distributed", reason="the cluster extra is not installed")
+    here = evaluate(run, tmp_path / "here", pairs=4, workers=2)
+    cluster = Cluster(tmp_path)
+    try:
+        cluster.staff(2)
+        there = evaluate(run, tmp_path / "there", pairs=4, scheduler=cluster.address)
+    finally:
+        cluster.close()
+    # One thread each, the same program: the same bytes.
+    assert there.json() == here.json()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("figure", "folder", "files"),
+    [
+        ("4", "figure4", {"plates.csv"}),
+        ("8", "figure8", {"depths.csv"}),
+        ("bench", "bench", {"measurement.toml", "hidden.toml", "images.csv", "throughput.json"}),
+    ],
+)
+def test_a_figure_has_its_numbers_beside_it(run: Path, tmp_path: Path, figure: str, folder: str, files: set[str]):
+    code, said, told = call("evaluate", run, "--figure", figure, "--draws", 1, "--out", tmp_path)
+    assert code == 0, told
+    names = {path.name for path in (tmp_path / folder).iterdir()}
+    assert {*files, "figure.png", "manifest.json"} <= names
+    assert set(said.splitlines()) == {str(tmp_path / folder), *(str(tmp_path / folder / name) for name in names)}
+    if figure == "bench":
+        assert load_measurement(tmp_path / folder / "measurement.toml").image
+    else:
+        rows = list(csv.DictReader(io.StringIO((tmp_path / folder / min(files)).read_text())))
+        expected = {"thin lens", "Fresnel", "random", "ring", "proposed"} if figure == "4" else {"as drawn", "draw 0"}
+        assert {row["plate"] for row in rows} == expected
+
+
+def test_the_paper_has_no_other_figure_of_optics(run: Path):
+    code, _, told = call("evaluate", run, "--figure", "5")
+    assert code == 2
+    assert "--figure: must be one of 4, 8, bench" in told
+
+
+def test_the_command_prints_where_the_table_is(run: Path, tmp_path: Path):
+    code, said, told = call("evaluate", run, "--pairs", 1, "--workers", 0, "--out", tmp_path / "out")
+    assert code == 0, told
+    assert str(tmp_path / "out/table2-dirt-paper/table.csv") in said.splitlines()
+    assert "conventional capture" in told
+    for options, words in (
+        (("--table", 3), "must be 1 or 2"),
+        (("--pairs", 0), "must be at least 1"),
+        (("--images", tmp_path), "--test"),
+        (("--occlusion", "real"), "must be one of"),
+        (("--method", "x"), "--method"),
+    ):
+        code, _, told = call("evaluate", run, *options, "--out", tmp_path / "other")
+        assert code == 2
+        assert words in told

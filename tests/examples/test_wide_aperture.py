@@ -1,0 +1,91 @@
+"""The wide aperture behind dirt: its numbers by closed forms, and the whole example at a size that shows it works."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from doedesign.capture.images import Pictures, sample_files
+from doedesign.spec import load_spec
+from sim.camera import path_at_m
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
+
+import wide_aperture  # pyright: ignore[reportMissingImports]
+
+
+@pytest.mark.parametrize(("nearest_m", "waves"), [(1.0, 14.8), (2.0, 7.4), (5.0, 3.0)])
+def test_a_plain_wide_aperture_is_out_of_focus_at_both_ends(nearest_m: float, waves: float):
+    """D² / 8 |1/z - 1/z0| waves at the rim, z0 the middle of the range in dioptres."""
+    middle = 2 * nearest_m
+    assert 0.0114**2 / 8 * (1 / nearest_m - 1 / middle) / 550e-9 == pytest.approx(waves, abs=0.05)
+
+
+def test_the_lens_is_focused_in_the_middle_of_its_range():
+    camera, spec = wide_aperture.camera_of(wide_aperture.CAMERAS[-1])
+    rim = np.array([camera.aperture_m / 2])
+    ends = [path_at_m(camera, rim, np.zeros(1), depth)[0] / 550e-9 for depth in (2.0, 4.0, np.inf)]
+    # Chrome takes 5 um of the rim all round, 0.2 % of the waves.
+    assert ends == pytest.approx([7.384, 0.0, -7.384], abs=0.02)
+    depths = np.array(wide_aperture.depths_of(spec))
+    assert np.diff(1 / depths) == pytest.approx(-np.full(6, 1 / 12), abs=1e-9)
+
+
+def test_every_camera_exposes_as_long():
+    white = {}
+    for kind in wide_aperture.CAMERAS:
+        bench = wide_aperture.Bench(kind, 32, Path(), None)
+        white[kind.name] = float(bench.sensor().white_e(3).mean())
+    assert white["open"] == white["plate"] == 16000
+    assert white["stop"] == pytest.approx(16000 * (4.44 / 11.4) ** 2, rel=5e-3)  # chrome on the rim
+    assert white["f2"] == pytest.approx(16000 * (8 / 11.4) ** 2, rel=5e-3)
+
+
+def test_scenes_are_about_dirt_and_what_is_believed_of_it_is_off():
+    plan = wide_aperture.Plan(size=32)
+    pictures = Pictures(sample_files()[:1], 256)
+    scenes = wide_aperture.scenes_of(pictures, plan, 3, 0)
+    again = wide_aperture.scenes_of(pictures, plan, 3, 0)
+    for scene, same in zip(scenes, again, strict=True):
+        assert np.array_equal(scene.believed, same.believed)
+        assert scene.covered[16, 16] > 0.3  # coarse pixels are eight wide, and linear between
+        assert 0.05 <= scene.near_m <= 0.12
+        assert abs(scene.believed_m / scene.near_m - 1) == pytest.approx(0.03)
+        assert np.abs(scene.believed_radiance / scene.radiance - 1) == pytest.approx(0.07, rel=1e-3)
+        assert 0 < np.mean(np.abs(scene.believed - scene.blocked)) < 0.2
+
+
+def test_the_spec_says_what_is_designed():
+    spec = load_spec(wide_aperture.SPEC)
+    assert (spec.optimize.parametrization, spec.process.levels) == ("radial", 16)
+    assert spec.objectives[0].name == "filtered_error"
+
+
+@pytest.mark.slow
+def test_the_whole_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With smaller apertures, few steps and scenes: every table and picture, and the same again from files."""
+    small = (
+        wide_aperture.SPEC.read_text().replace("steps = 1000", "steps = 4").replace("samples = 1500", "samples = 300")
+    )
+    spec = tmp_path / "small.toml"
+    spec.write_text(small.replace('"11.4 mm"', '"2.28 mm"'))
+    monkeypatch.setattr(wide_aperture, "SPEC", spec)
+    monkeypatch.setattr(wide_aperture, "DRAWS", 1)
+    kinds = (
+        wide_aperture.CameraKind("stop", "1.14 mm", 150, 2),
+        wide_aperture.CameraKind("plate", "2.28 mm", 300, 3, True),
+    )
+    monkeypatch.setattr(wide_aperture, "CAMERAS", kinds)
+    plan = wide_aperture.Plan(size=48, scenes=2, judged=2, steps=2, width=4)
+    files = sample_files()
+    found = wide_aperture.run(tmp_path / "out", plan, files[:2], files[2:4])
+    rows = list(csv.DictReader((tmp_path / "out" / "scores.csv").read_text().splitlines()))
+    # Two ways, three depths, two scenes: both cameras in two lights, and a plate as fabricated.
+    assert len(rows) == 2 * 3 * 2 * (2 + 2 + 1)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()).keys() == found.keys()
+    assert (tmp_path / "out" / "wide_aperture.png").stat().st_size > 10_000
+    assert "plate / fabricated 0 / network / 1.0 over stop" in found["worst depth, plate over rival"]
+    assert wide_aperture.run(tmp_path / "out", plan, files[:2], files[2:4]) == found

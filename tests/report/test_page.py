@@ -1,0 +1,373 @@
+"""The page of a run: what it gathers, when a part appears, and what it refuses."""
+
+import csv
+import json
+import re
+import shutil
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import doedesign as dd
+from doedesign.report.page import tiles
+from doedesign.report.page.blocks import BarBlock, ChartBlock, MapBlock, PageContent, PictureBlock, PsfBlock, TableBlock
+from doedesign.report.page.compare import compared
+from doedesign.report.page.files import open_files, safe_json
+from doedesign.report.page.gather import gather
+from doedesign.report.page.numbers import LABELS, SHARES
+from doedesign.report.page.reached import reached_section
+from doedesign.report.page.write import watch_report
+from doedesign.runs.folder import LEVEL_MAP, load_checkpoint, open_run
+from doedesign.runs.results import results_folder
+from fab.errors import InputError
+from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes
+from fab.level_map import read_level_map
+from fab.order.write import write_order
+from sim.metrics import METRICS
+from sim.store import read_stored_bank, write_bank
+from tests.doedesign.small_runs import SPREAD, call
+
+# As `tolerance` writes them, of three plates of which one breaks a limit.
+_ROW = {"colour": "550 nm", "depth_m": None, "key": "nominal", "strehl": 1.0, "zeroth_order": 0.3}
+_SPREAD = {"max": 0.99, "mean": 0.93, "median": 0.95, "min": 0.85, "p05": 0.86, "p95": 0.985, "std": 0.06}
+_WORST = {"colour": None, "depth_m": None, **_SPREAD}
+_SHARE = {"share": 2 / 3, "low": 0.2, "high": 0.94, "good": 2, "plates": 3}
+_EFFECT = {"error": "overlay_x_m[1]", "source": "overlay", "quantity": "strehl", "colour": None}
+PLATES: dict[str, Any] = {
+    "count": 3,
+    "statistics": [{"quantity": name, **_WORST} for name in ("strehl", "zeroth_order")],
+    "yield": {**_SHARE, "limits": [{"limit": "strehl >= 0.9", **_SHARE}]},
+}
+STUDY: dict[str, Any] = {
+    "design": "small",
+    "plan": {"draws": 3, "wanted": 0.9},
+    "seed": 0,
+    "nominal": [_ROW],
+    "one_at_a_time": [{**_EFFECT, "low": 0.9, "expected": 1.0, "high": 0.91, "variance": 0.01}],
+    "plates": PLATES,
+    "shares": {"strehl": {"overlay": 0.8, "depth": 0.2}},
+}
+DRAWS = "key,colour,depth_m,strehl,zeroth_order\n" + "".join(
+    f"normal/{k},550 nm,inf,{value},0.3\n" for k, value in enumerate((0.85, 0.95, 0.99))
+)
+
+
+def made(folder: Path, spec: str) -> Path:
+    """Optimise a spec into FOLDER/run, with its pictures."""
+    (folder / "small.toml").write_text(spec)
+    code, _, told = call("optimize", folder / "small.toml", "--out", folder / "run")
+    assert code == 0, told
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with PSFs and a tolerance study."""
+    run = made(tmp_path_factory.mktemp("page"), SPREAD)
+    design = dd.open_design(run, False)
+    import sim
+
+    with results_folder(run / "psf", "small", run) as folder:
+        assert folder is not None
+        write_bank(folder / "quantised.exr", sim.psf(design, depths=["6 mm", "inf"]))
+    write_study(run, STUDY)
+    return run
+
+
+def write_study(run: Path, study: dict[str, Any]) -> None:
+    with results_folder(run / "tolerance", "small", run) as folder:
+        assert folder is not None
+        (folder / "results.json").write_bytes(canonical_json(study))
+        (folder / "draws.csv").write_text(DRAWS)
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the run that may be changed."""
+    return Path(shutil.copytree(finished, tmp_path / "runs" / "small"))
+
+
+def blocks(content: PageContent, kind: type) -> list[Any]:
+    return [block for part in content.sections for block in part.blocks if isinstance(block, kind)]
+
+
+def names(content: PageContent) -> list[str]:
+    return [part.name for part in content.sections]
+
+
+def bars(content: PageContent) -> dict[str, Any]:
+    return {bar.label: bar for block in blocks(content, BarBlock) for bar in block.bars}
+
+
+def test_parts_appear_when_their_data_exist(run: Path):
+    assert names(gather(run)) == ["reached", "map", "light", "budget", "tolerance", "provenance"]
+    for folder in ("psf", "tolerance"):
+        shutil.rmtree(run / folder)
+    content = gather(run)
+    assert names(content) == ["reached", "map", "light", "budget", "provenance"]
+    assert blocks(content, PsfBlock) == []
+
+
+def test_what_was_asked_stands_beside_what_was_reached(run: Path):
+    found, metrics = bars(gather(run)), json.loads((run / "metrics.json").read_text())
+    near, far = metrics["psf"]
+    assert found["light in the far spot"].value == pytest.approx(far["far_spot"])
+    spread = found["concentration of near light"]
+    assert (spread.value, spread.mark) == pytest.approx((near["concentration"], near["concentration_bound"]))
+    assert found["plates that obey every limit"].state == "missed"
+    assert found["plates that obey every limit"].mark == 0.9
+    assert found["overlay"].value == 0.8
+    drawn = found["as drawn, a thin element"]
+    assert drawn.value == pytest.approx(far["zeroth_order"])
+    fabricated = found["as fabricated, 3 plates, their worst colour"]
+    assert (fabricated.low, fabricated.value, fabricated.high) == (0.86, 0.95, 0.985)
+    write_study(run, STUDY | {"plates": PLATES | {"yield": None}})
+    assert "No limits were given" in blocks(gather(run), BarBlock)[-1].note
+
+
+@pytest.mark.parametrize(
+    ("wanted", "title"), [(True, "0th order (one of the spots)"), (False, "0th order"), (None, "0th order")]
+)
+def test_a_zeroth_order_that_is_a_spot_is_told_as_one(run: Path, wanted: bool | None, title: str):
+    metrics = json.loads((run / "metrics.json").read_text())
+    if wanted is not None:
+        orders = {"on_target": 0.9, "uniformity_error": 0.001, "spots": [0.1], "zeroth_order_wanted": wanted}
+        metrics["orders"] = orders
+    part = reached_section(open_files(run), metrics, ())
+    assert part is not None
+    assert title in [block.title for block in part.blocks if isinstance(block, BarBlock)]
+
+
+def test_curves_are_those_of_the_table(run: Path):
+    charts = {chart.title: chart for chart in blocks(gather(run), ChartBlock)}
+    near, far = (charts[f"MTF, source at {depth}"] for depth in ("6 mm", "∞"))
+    assert (near.x_log, far.x_log) == (True, False)
+    rows = [row for row in csv.DictReader((run / "mtf.csv").read_text().splitlines()) if row["depth_m"] == "inf"]
+    plate, without = far.series
+    assert far.x == tuple(float(row["frequency_per_mm"]) for row in rows)
+    assert plate.y == tuple(float(row["design"]) for row in rows)
+    assert without.y == tuple(float(row["without"]) for row in rows)
+    assert (plate.hue, without.hue, without.dashed) == (0, 0, True)
+    assert charts["Encircled energy, source at 6 mm"].x_label == "radius (µm)"
+    # Without the tables, as in runs of before, the pictures stand there.
+    record = json.loads((run / MANIFEST_NAME).read_text())
+    for name in ("mtf.csv", "encircled.csv"):
+        del record["results_sha256"][name]
+    (run / MANIFEST_NAME).write_bytes(canonical_json(record))
+    assert {"MTF", "Encircled energy"} <= {block.title for block in blocks(gather(run), PictureBlock)}
+
+
+def test_histograms_count_every_plate_once(run: Path):
+    charts = [chart for chart in blocks(gather(run), ChartBlock) if chart.title.startswith("Plates by")]
+    assert [chart.title for chart in charts] == ["Plates by relative Strehl ratio"]  # the 0th order of all is the same
+    counts = charts[0].series[0].y
+    assert sum(count for count in counts if count is not None) == 3
+    assert (charts[0].x[0], charts[0].x[-1]) == (0.85, 0.99)
+
+
+def test_the_map_is_that_of_the_run(run: Path):
+    level_map = read_level_map(run / LEVEL_MAP)
+    block = blocks(gather(run), MapBlock)[0]
+    assert block.views == ("height", "mask 1", "mask 2")
+    data = block.data
+    assert (data["width"], data["height"], data["reductions"]) == (48, 48, [1])
+    shown = np.where(level_map.relief.inside(level_map.grid), level_map.level, np.uint8(255))[::-1]
+    assert data["whole"] == [[tiles.tile_data(np.ascontiguousarray(shown))]]
+    levels = next(table for table in blocks(gather(run), TableBlock) if table.title == "Levels")
+    assert len(levels.rows) == 4
+
+
+def test_psfs_keep_their_light(run: Path):
+    block = blocks(gather(run), PsfBlock)[0]
+    bank = read_stored_bank(run / "psf" / "quantised.exr")
+    assert block.depths == ("6 mm", "∞")
+    assert block.data["peak"]["1,0"] == pytest.approx(float(bank.energy[0, 1].max()), rel=1e-4)
+    assert set(block.data["pictures"]) == {"0,0,0", "0,1,0"}
+
+
+@pytest.mark.slow
+def test_an_order_adds_its_files(run: Path):
+    level_map = read_level_map(run / LEVEL_MAP)
+    order = run.parent.parent / "masks" / "small"
+    write_order(order, level_map, source={"kind": "run", "level_map_sha256": level_map.digest})
+    content = gather(run)
+    assert "order" in names(content)
+    kinds = [block.kind for part in content.sections if part.name == "order" for block in part.blocks]
+    assert {"model", "table"} <= set(kinds)
+    glb = next(order.glob("*_RELIEF.glb"))
+    glb.write_bytes(glb.read_bytes() + b" ")
+    with pytest.raises(InputError, match="must be the file that the manifest lists"):
+        gather(run)
+
+
+@pytest.mark.slow
+def test_the_order_of_another_run_is_left_aside_and_refused_if_given(run: Path):
+    level_map = read_level_map(run / LEVEL_MAP)
+    other = level_map.with_level(np.zeros_like(level_map.level))
+    order = run.parent.parent / "masks" / "small"
+    write_order(order, other, source={"kind": "run", "level_map_sha256": other.digest})
+    assert "order" not in names(gather(run))
+    with pytest.raises(InputError, match="must be the mask order of this run"):
+        gather(run, order)
+
+
+def test_same_inputs_same_bytes(run: Path, tmp_path: Path):
+    first = dd.write_report(run, out=tmp_path / "a.html").read_bytes()
+    assert dd.write_report(run, out=tmp_path / "b.html").read_bytes() == first
+    code, said, _ = call("report", run, "--json")
+    assert code == 0
+    path = Path(json.loads(said)["paths"][0])
+    assert path == run / "report.html"
+    assert path.read_bytes() == first
+
+
+def test_nothing_on_the_page_needs_a_network(run: Path):
+    text = dd.write_report(run).read_text()
+    assert "default-src 'none'" in text
+    own = re.sub(r"<script[^>]*>.*?</script>|<style>.*?</style>|<pre.*?</pre>", "", text, flags=re.DOTALL)
+    addresses = re.findall(r"(?:src|href)=\"([^\"]*)\"", own)
+    assert addresses
+    assert [one for one in addresses if not one.startswith(("data:", "#"))] == []
+
+
+EVIL = "</script><img src=x onerror=alert(1)>\u2028&amp;"
+
+
+def test_text_of_files_is_escaped(run: Path):
+    """A name with HTML in it, in every file that a page quotes: spec, manifests, tables."""
+    manifest = json.loads((run / MANIFEST_NAME).read_text())
+    manifest["version"] = EVIL
+    (run / MANIFEST_NAME).write_bytes(canonical_json(manifest))
+    found = {**_SHARE, "limits": [{"limit": f"strehl >= 0.9 {EVIL}", **_SHARE}]}
+    plates = PLATES | {"yield": found}
+    write_study(run, STUDY | {"plates": plates, "shares": {"strehl": {EVIL: 1.0}}})
+    text = dd.write_report(run).read_text()
+    assert "<img src=x" not in text
+    assert f"strehl >= 0.9 {EVIL}" in unescape(text)
+
+
+def test_data_cannot_end_their_script():
+    text = safe_json({"a": EVIL, "b": "<!--<script>"})
+    assert "<" not in text
+    assert ">" not in text
+    assert json.loads(text) == {"a": EVIL, "b": "<!--<script>"}
+
+
+@pytest.mark.parametrize("file", ["metrics.json", "psf/quantised.exr", "tolerance/results.json", "tolerance/draws.csv"])
+def test_changed_files_are_refused(run: Path, file: str):
+    with (run / file).open("ab") as stream:
+        stream.write(b" ")
+    code, said, told = call("report", run)
+    assert code == 2
+    assert said == ""
+    assert file.rpartition("/")[2] in told
+    assert "must be the file that the manifest lists" in told
+    assert not (run / "report.html").exists()
+
+
+def test_results_of_another_form_are_refused(run: Path):
+    """Such as those of a version to come: the message names the part, and there is no traceback."""
+    write_study(run, {"plates": {"count": 3}})
+    code, _, told = call("report", run)
+    assert code == 2
+    assert "small: what was reached: must hold what the commands of this version write" in told
+    (run / "trained").mkdir()
+    shutil.rmtree(run / "tolerance")
+    (run / "trained" / "history.jsonl").write_text('{"step": 0, "loss": "much"}\n')
+    code, _, told = call("report", run)
+    assert code == 2
+    assert "small: training: must hold" in told
+
+
+def test_no_run_no_page(tmp_path: Path):
+    code, _, told = call("report", tmp_path / "nothing")
+    assert code == 2
+    assert "must be a run folder" in told
+
+
+@pytest.mark.slow
+def test_a_run_at_work_shows_its_loss(run: Path, tmp_path: Path):
+    """Up to its last checkpoint; then, once it is done, all of it."""
+    spec = tmp_path / "steps.toml"
+    spec.write_text(SPREAD.replace("steps = 0", "steps = 3\ncheckpoint_every = 1"))
+    folder = tmp_path / "runs" / "steps"
+    halt = iter(range(2))
+
+    def stop(*_: object) -> None:
+        if next(halt, None) is None:
+            raise KeyboardInterrupt
+
+    from doedesign.runs import folder as folders
+
+    before = folders.save_checkpoint
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("doedesign.optimization.save_checkpoint", lambda *given: (before(*given), stop()))
+        assert call("optimize", spec, "--out", folder)[0] == 130
+    content = gather(folder)
+    assert names(content)[0] == "history"
+    assert "at work" in content.summary[0]
+    assert len(blocks(content, ChartBlock)[0].x) >= 2
+    pages = watch_report(folder, out=tmp_path / "live.html", every_s=0.01)
+    first = next(pages).read_bytes()
+    assert b"at work" in first
+    assert call("optimize", spec, "--out", folder)[0] == 0
+    assert [path.read_bytes() != first for path in pages] == [True]  # once more, and it ends with the run
+    assert load_checkpoint(open_run(folder), []) is None
+    assert "map" in names(gather(folder))
+
+
+@pytest.mark.slow
+def test_runs_side_by_side(run: Path, tmp_path: Path):
+    other = tmp_path / "other"
+    other.mkdir()
+    second = made(other, SPREAD.replace('start = "ring"', 'start = "flat"'))
+    content = compared([run, second])
+    assert [part.name for part in content.sections] == ["reached", "metrics", "maps", "specs"]
+    table = next(block for block in blocks(content, TableBlock) if block.title.startswith("Metrics"))
+    metrics = [json.loads((one / "metrics.json").read_text())["psf"] for one in (run, second)]
+    row = next(row for row in table.rows if row[:2] == ("0th order", "∞"))
+    off = metrics[1][1]["zeroth_order"] - metrics[0][1]["zeroth_order"]
+    assert row[4].startswith(f"{'+' if off >= 0 else '−'}{100 * abs(off):.2f} %")
+    difference = blocks(content, MapBlock)[2]
+    changed = read_level_map(run / LEVEL_MAP).level != read_level_map(second / LEVEL_MAP).level
+    inside = read_level_map(run / LEVEL_MAP).relief.inside(read_level_map(run / LEVEL_MAP).grid)
+    assert f"{100 * changed[inside].mean():.2f} % of the pixels differ" in difference.data["views"][0]["legend"]
+    specs = next(block for block in blocks(content, TableBlock) if block.title.startswith("Keys"))
+    assert ("optimize.start", "ring", "flat") in specs.rows
+    code, said, _ = call("report", run, "--compare", second)
+    assert code == 0
+    assert Path(said.strip()) == run / "comparison.html"
+    code, _, told = call("report", run, "--compare", second, "--watch")
+    assert code == 2
+    assert "--watch" in told
+
+
+def test_tiles_cover_maps_of_any_shape():
+    """Every pixel lies in one tile, and sizes of all tiles have heads."""
+    for shape in ((1, 1), (512, 512), (513, 512), (1030, 2049)):
+        factors = tiles.reductions_of(shape)
+        assert max(tiles.reduced_shape(shape, factors[-1])) <= tiles.TILE
+        heads = tiles.heads(shape, factors)
+        numbers = np.zeros(shape, np.uint8)
+        rows = tiles.tile_rows(numbers)
+        assert (len(rows), len(rows[0])) == tuple(-(-n // tiles.TILE) for n in shape)
+        means = dict(tiles.reduced(np.ones(shape), factors))
+        assert list(means) == list(factors[1:])
+        for factor, mean in means.items():
+            assert mean.shape == tiles.reduced_shape(shape, factor)
+            np.testing.assert_allclose(mean, 1.0)
+        assert all(re.fullmatch(r"\d+x\d+", name) for name in heads)
+
+
+def test_digests_of_results_are_told(run: Path):
+    table = next(block for block in blocks(gather(run), TableBlock) if block.title == "Digests")
+    told = dict(table.rows)
+    assert told["tolerance/draws.csv"] == sha256_bytes(DRAWS.encode())
+
+
+def test_numbers_have_the_names_of_the_table_of_metrics():
+    assert {name: one.label for name, one in METRICS.items()} == dict(LABELS)
+    assert {name for name, one in METRICS.items() if one.unit == "%"} == SHARES
