@@ -221,3 +221,13 @@ def test_the_cure_of_a_plate_without_errors_can_be_typed(monkeypatch: pytest.Mon
     _, _, said = call("psf", "runs/small", "--fabricated", "--seed", 0, "--process", "contact_aligner")
     assert "warning" not in said
     assert asked == ["ideal", "contact_aligner"]
+
+
+def test_a_run_that_lies_among_the_orders_is_not_taken_for_one(work: Path):
+    """A released model is kept in masks/ and has a manifest of its own, which is that of no order."""
+    released = work / "masks" / "coarse"
+    shutil.copytree(work / "runs" / "coarse", released)
+    (released / "manifest.json").write_text('{"format": "doedesign released model 1"}')
+    assert order_of_run("small", released, own_level_map(released)) == Path("masks/small")
+    (work / "masks" / "small").rename(work / "masks" / "other")
+    assert order_of_run("small", released, own_level_map(released)) == Path("masks/small")
