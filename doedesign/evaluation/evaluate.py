@@ -96,7 +96,7 @@ def evaluate(
         obstruction: kind, or folder of masks; that of the spec if None.
         pairs: number of test pairs.
         images: folder of pictures to train on; some of scikit-image's samples if None.
-        test: folder of pictures to judge by, none of which may be trained on; the others of them if None.
+        test: folder of pictures to judge by, with no name of a picture to train on; the others of them if None.
         licence: licence of the pictures to train on, for the record.
         train: train what is missing; otherwise such rows are left out.
         seeds: seeds of the trainings.
@@ -205,6 +205,7 @@ def _sources(folder: Path, images: str | Path | None, test: str | Path | None, l
         rule = "pictures to judge by must come from a folder of their own"
         raise InputError("test", rule, "none", "Give a folder of pictures that are not trained on.")
     if images is not None and test is not None:
+        _require_apart(Path(images), Path(test))
         return Sources(Path(images), Path(test), licence)
     homes = folder / "pictures" / "trained_on", folder / "pictures" / "judged_by"
     samples = sample_files()
@@ -213,6 +214,16 @@ def _sources(folder: Path, images: str | Path | None, test: str | Path | None, l
             if path.suffix.lower() in PICTURE_FILES and not (home / path.name).is_file():
                 write_atomic(home / path.name, read_bytes(path))
     return Sources(homes[0], homes[1] if test is None else Path(test), licence)
+
+
+def _require_apart(images: Path, test: Path) -> None:
+    """Refuse pictures of one name in both folders, before any training: networks that saw them would have no score."""
+    known = {path.name for path in picture_files(images)}
+    if twice := [path.name for path in picture_files(test) if path.name in known]:
+        more = f" and {len(twice) - 1} more" if len(twice) > 1 else ""
+        got = f"{twice[0]}{more} in {images}, too"
+        cure = "Take out of one folder what is in both, or rename what is another picture."
+        raise InputError(str(test), "pictures to judge by must not be trained on", got, cure)
 
 
 def _plate_seen(method: ExternalMethod, plates: Mapping[str, PlateBanks]) -> str | None:

@@ -25,8 +25,7 @@ class Block(NamedTuple):
         line: number of its first line.
         language: what it is written in.
         text: what it says.
-        note: the comment above it: "with: NAME" names the spec that a fragment changes, "not run: REASON" says why a
-            block is read and not run.
+        note: the comment above it: "with: NAME" names the spec that a fragment changes.
     """
 
     page: str
@@ -39,11 +38,6 @@ class Block(NamedTuple):
     def where(self) -> str:
         """Page and line."""
         return f"{self.page}:{self.line}"
-
-    @property
-    def runs(self) -> bool:
-        """Whether the tests run it."""
-        return not self.note.startswith("not run:")
 
     @property
     def lines(self) -> list[str]:

@@ -359,6 +359,18 @@ def test_an_unfinished_robust_design_is_refused_before_anything_is_trained(run: 
     assert not (tmp_path / "out").exists()
 
 
+def test_pictures_to_judge_by_are_none_of_those_trained_on(run: Path, tmp_path: Path):
+    """Said before hours of training: by their names, as rows are left out by them."""
+    first, second, *_ = sample_files()
+    for folder, files in (("images", (first, second)), ("test", (second,))):
+        (tmp_path / folder).mkdir()
+        for path in files:
+            shutil.copy(path, tmp_path / folder)
+    with pytest.raises(InputError, match=f"must not be trained on, but got {second.name} in .*images, too"):
+        evaluate(run, tmp_path / "out", images=tmp_path / "images", test=tmp_path / "test", train=True)
+    assert not (tmp_path / "out" / "trained").exists()
+
+
 def test_a_program_is_found_out(run: Path, tmp_path: Path):
     out = tmp_path / "out"
     with pytest.raises(InputError, match="must be a program that can be run"):
