@@ -320,9 +320,9 @@ FOLDERS: tuple[WrittenFolder, ...] = (
         ),
     ),
     WrittenFolder(
-        "masks/released/",
+        "masks/released/, masks/released-raindrop/",
         "examples/release_model.py",
-        "A released model: network and plate, which `reconstruct` takes where none is named.",
+        "A released model: network and plate; `reconstruct` takes the first where none is named.",
         (
             WrittenFile("spec.toml", "the spec"),
             *_DESIGN[:2],
@@ -351,7 +351,7 @@ FOLDERS: tuple[WrittenFolder, ...] = (
 def folder_of(path: str) -> WrittenFolder | None:
     """The entry of a folder such as "runs/quick/psf"; None for one that no command writes."""
     parts = PurePosixPath(path).parts
-    known = {tuple(PurePosixPath(one.path.partition(",")[0]).parts): one for one in FOLDERS}
+    known = {PurePosixPath(place.strip()).parts: one for one in FOLDERS for place in one.path.split(",")}
     if len(parts) == 3:
         return known.get(("RUN", parts[2])) if parts[0] == "runs" else None
     return known.get(parts) or (known.get((parts[0], "NAME")) if len(parts) == 2 else None)

@@ -60,7 +60,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     made = tmp_path / "documentation"
     made.mkdir()
     shutil.copytree(ROOT / "examples", made / "examples")
-    shutil.copytree(ROOT / "masks" / "released", made / "masks" / "released")
+    for name in ("released", "released-raindrop"):
+        shutil.copytree(ROOT / "masks" / name, made / "masks" / name)
     for number, name in enumerate(("chelsea", "astronaut", "coffee", "rocket")):
         picture = getattr(data, name)()
         for pictures, shown in (("pictures", picture), ("others", picture[::-1]))[: 1 + number // 2]:

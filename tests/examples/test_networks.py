@@ -34,8 +34,9 @@ def psnr(image: np.ndarray, scene: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((image - scene) ** 2)))
 
 
-def test_the_released_model_is_what_its_manifest_says():
-    folder = ROOT / RELEASED
+@pytest.mark.parametrize("name", ["", "-raindrop"])
+def test_a_released_model_is_what_its_manifest_says(name: str):
+    folder = ROOT / f"{RELEASED}{name}"
     said = read_json(folder / "manifest.json")
     digests = said["results_sha256"]
     assert {path.name for path in folder.iterdir() if path.is_file()} == {"manifest.json", *digests}

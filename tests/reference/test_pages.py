@@ -80,7 +80,9 @@ def test_tables_have_no_open_cells(texts: dict[str, str]) -> None:
             assert len({len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines()}) == 1, table[:200]
 
 
-@pytest.mark.parametrize("folder", ["masks/automotive-2400", "masks/dslr-2800", "masks/released"])
+@pytest.mark.parametrize(
+    "folder", ["masks/automotive-2400", "masks/dslr-2800", "masks/released", "masks/released-raindrop"]
+)
 def test_files_of_released_folders_are_described(folder: str) -> None:
     entry = next(one for one in FOLDERS if f"{folder}/" in one.path)
     names = [path.name for path in (ROOT / folder).iterdir()]
@@ -100,6 +102,7 @@ def test_files_of_an_order_are_described() -> None:
         ("runs/quick", "runs/NAME/"),
         ("runs/quick/psf", "RUN/psf/"),
         ("masks/quick", "masks/NAME/"),
+        ("masks/released-raindrop", "masks/released/, masks/released-raindrop/"),
         ("runs/quick/x", ""),
     ],
 )
