@@ -70,6 +70,7 @@ def test_released_folders_are_found_and_whole():
         "dslr-2800": ("run", "done"),
         "example": ("order", "done"),
         "released": ("released model", "done"),
+        "released-raindrop": ("released model", "done"),
     }
     # Beside them lie orders of whoever drew some, such as `make demo`.
     assert {name: (one.kind, one.state) for name, one in found.items() if name in released} == released
