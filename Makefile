@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PINS := constraints.txt
 FORMATTED := doedesign fab sim tests bench examples docs
 
-.PHONY: demo train-demo test test-slow campaign mutants lint bench docs clean
+.PHONY: demo train-demo test test-slow studies campaign mutants lint bench docs clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.base
@@ -20,10 +20,14 @@ train-demo: $(VENV)/.base
 	$(BIN)/python examples/train_demo.py
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow and not study"
 
 test-slow: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m slow --durations=30
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "slow and not study" --durations=40
+
+# Minutes each, of what shorter tests show in part: before a release.
+studies: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m study --durations=0
 
 # Minutes; hours with a count: make campaign CAMPAIGN="kills mutations --count 10000"
 campaign: $(VENV)/.dev

@@ -187,7 +187,8 @@ def _statement(file: str, line: int) -> set[int]:
 
 
 def _pytest(tree: Path, arguments: Sequence[str], limit_s: float) -> subprocess.CompletedProcess[bytes]:
-    command = [sys.executable, "-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *arguments]
+    quick = ("-m", "not slow and not study")
+    command = [sys.executable, "-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", *quick, *arguments]
     environment = os.environ | {"PYTHONPATH": str(tree), "COVERAGE_FILE": str(tree / "coverage")}
     return subprocess.run(command, cwd=tree, env=environment, capture_output=True, check=False, timeout=limit_s)
 

@@ -195,7 +195,7 @@ def processor_time_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_first_order_from_an_empty_folder(installed: Installed, tmp_path: Path):
     """The script of the first screen, by the installed command, from the new spec to the report of the order."""
     script = (ROOT / "examples" / "first_order.sh").read_text("utf-8")

@@ -17,7 +17,8 @@ SHOWN = {"tutorial": 8, "cookbook": 12}
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("name", SHOWN)
+# What the tutorial does, the documentation's commands do.
+@pytest.mark.parametrize("name", [pytest.param("tutorial", marks=pytest.mark.study), "cookbook"])
 # ipykernel leaves sockets to the interpreter's end, which pytest would take for this test's.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_notebook_runs_and_shows_its_results(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

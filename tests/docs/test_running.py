@@ -24,16 +24,8 @@ pytestmark = pytest.mark.slow
 # Pages whose commands run, a folder for each row: later pages go on with the runs of earlier ones.
 SESSIONS = (
     ("docs/start.md", "README.md"),
-    (
-        "docs/tutorial.md",
-        "docs/commands/design.md",
-        "docs/commands/light.md",
-        "docs/commands/fabrication.md",
-        "docs/commands/network.md",
-        "docs/commands/looking.md",
-        "docs/klayout.md",
-        "docs/notebooks.md",
-    ),
+    ("docs/tutorial.md", "docs/commands/fabrication.md", "docs/klayout.md", "docs/notebooks.md"),
+    ("docs/commands/design.md", "docs/commands/light.md", "docs/commands/network.md", "docs/commands/looking.md"),
     ("docs/tasks/spots.md",),
     ("docs/tasks/areas.md",),
     ("docs/tasks/foci.md",),
@@ -42,12 +34,13 @@ SESSIONS = (
     ("docs/tasks/tables.md",),
 )
 # Compiling a large network takes longer than a few steps of a small one.
-SMALL = ("train.steps=2", "train.validation=1", "network.depth=1", "network.width=3")
+CHANGES = ("train.steps=2", "train.validation=1", "network.depth=1", "network.width=3")
+SMALL = [word for change in CHANGES for word in ("--set", change)]
 # What a full design of a template or a training takes minutes for is cut short; the command is otherwise as it stands.
 SHORT = {
     "optimize": ["--set", "optimize.steps=2"],
-    "train": ["--set", "train.steps=2"],
-    "evaluate": [*(word for change in SMALL for word in ("--set", change)), "--pairs", "2"],
+    "train": SMALL,
+    "evaluate": [*SMALL, "--pairs", "2"],
     "examples/snapshot_hdr.py": ["--scenes", "1", "--others", "1", "--case", "without lamps"],
     "examples/snapshot_hdr_network.py": ["--scenes", "1", "--examples", "2", "--steps", "2"],
 }

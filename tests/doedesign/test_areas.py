@@ -506,7 +506,7 @@ def test_one_area_may_be_written_either_way(tmp_path: Path):
     assert list(kept_pictures(pictures).values()) == ["area_0_picture.png", "area_1_picture.png"]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_run_with_several_areas_leads_to_tables_and_pictures(tmp_path: Path):
     spec = several(tmp_path, [f'{LEFT}\ncolour = "638nm"', f'{RIGHT}\ncolour = "450nm"'], *TWO_COLOURS)
     optimize(spec, tmp_path / "run")

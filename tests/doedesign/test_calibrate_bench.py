@@ -129,7 +129,7 @@ def test_a_camera_taken_for_upright_spoils_the_errors(tmp_path: Path):
     assert any(abs(errors[name][0]) > LIMITS[name.partition("[")[0]] for name in errors if name in LIMITS)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize(("light", "plates"), [("scalar", 3), ("edges", 4)])
 def test_standard_deviations_are_honest(tmp_path: Path, light: Literal["scalar", "edges"], plates: int):
     """Plates and cameras: what is promised of all, and nine errors in ten within two standard deviations."""

@@ -104,7 +104,7 @@ def test_throughput_of_a_flat_plate_is_that_of_its_faces():
     assert found.needed == pytest.approx(0.9237, abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_calibration_finds_the_plate_on_a_bench_it_is_not_told_of(tmp_path: Path):
     design = plate_drawn(64, 8, window=48)
     process = usual_process(design)

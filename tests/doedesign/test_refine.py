@@ -71,7 +71,7 @@ def coupled(level: np.ndarray, step: float, order: int) -> float:
     return float(np.mean([one.transmitted[one.at(order)] for one in found]))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_blazed_grating_of_three_waves_gains_by_another_solver():
     """Scalar light rates four levels at sinc²(1/4) = 81 %; of so small a period Maxwell leaves 66 %, 80 % refined."""
     task, step = blazed_task(60), WAVE / (GLASS - 1) / 4
@@ -238,7 +238,7 @@ def test_too_large_a_cell_is_told_how_large_it_may_be(run: Path, tmp_path: Path,
         refine(run, tmp_path / "refined")
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_binary_grid_from_its_spec_to_its_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Through the command; what is drawn obeys the process, and light gained by more terms than it was refined with."""
     monkeypatch.chdir(tmp_path)

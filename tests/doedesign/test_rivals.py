@@ -51,6 +51,9 @@ from tests.recon.test_train_command import SPEC, content
 SIDE, COLOURS = 32, 3
 WIDTHS = {"plain_unet": 4, "pyramid_deblurring": 4, "fourier_inpainting": 4, "two_stream_inpainting": 4}
 FILLS_HOLES = ("fourier_inpainting", "two_stream_inpainting")
+# Those that compile fastest are tried at every change.
+FASTEST = ("plain_unet", "pyramid_deblurring", "fourier_inpainting")
+EVERY = [pytest.param(name, marks=pytest.mark.slow if name in FASTEST else pytest.mark.study) for name in RIVALS]
 
 
 def quickly(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -115,8 +118,7 @@ def numbers(tree: Any) -> list[np.ndarray]:
 # --- every rival -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", RIVALS)
+@pytest.mark.parametrize("name", EVERY)
 def test_every_weight_is_learnt(name: str):
     _, answer, slope, judged = looked(name)
     assert answer.picture.shape == (2, SIDE, SIDE, COLOURS)
@@ -126,8 +128,7 @@ def test_every_weight_is_learnt(name: str):
             assert np.abs(leaf).max() > 0, jax.tree_util.keystr(where)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", RIVALS)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_rival_learns(name: str):
     network, losses = drawn(name), []
     moments = optax.scale_by_adam().init(eqx.filter(network, eqx.is_inexact_array))
@@ -512,7 +513,7 @@ def test_a_training_on_scenes_with_holes(design: Design, images: Path, monkeypat
     np.testing.assert_array_equal(restored[:, mask < 0.5], picture[:, mask < 0.5])
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", RIVALS)
 def test_every_rival_is_trained(name: str, design: Design, images: Path, tmp_path: Path):
     found = train_rival(name, design, images, tmp_path / "out", width=width_of(name), steps=2, batch=2)

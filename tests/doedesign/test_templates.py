@@ -56,8 +56,10 @@ def test_each_loads_without_a_warning(name: str, tmp_path: Path) -> None:
     assert len(template_summary(name)) < 120
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(SMALL))
+# The others are designed, at full size, by the pages on tasks.
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in LEAST else pytest.mark.study) for n in sorted(SMALL)]
+)
 def test_each_ends_in_a_verified_order(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leave_out_pictures(monkeypatch, doedesign.optimization)
     path = tmp_path / "spec.toml"

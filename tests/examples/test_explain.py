@@ -14,7 +14,7 @@ import pytest
 import doedesign.optimization
 from tests.pictures import leave_out_pictures
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.study
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LIFTS = (0, 8)

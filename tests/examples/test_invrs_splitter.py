@@ -57,7 +57,7 @@ def test_other_arrays_are_refused(design: np.ndarray, tmp_path: Path, capsys, mo
     assert "180 x 180 numbers from 0 to 1" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_best_public_entry_has_its_public_score():
     """0.5964 on the board: total 0.6405, uniformity error 0.0689."""
     pytest.importorskip("fmmax")

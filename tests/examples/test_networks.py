@@ -75,7 +75,7 @@ def test_a_released_model_is_trained_on_free_pictures_alone(tmp_path: Path):
     assert set(alone.licences) == set(train_released.SAMPLES)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_released_plate_is_taken_like_that_of_a_run(tmp_path: Path):
     """Its PSFs are those that were released; masks and captures are made of it, as of any run."""
     folder = ROOT / RELEASED
@@ -94,7 +94,7 @@ def test_the_released_plate_is_taken_like_that_of_a_run(tmp_path: Path):
         psfs(folder, tmp_path / "order", [far_m])["continuous"]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_reconstruct_works_out_of_the_box(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -110,14 +110,14 @@ def test_reconstruct_works_out_of_the_box(
     assert psnr(images[1], chain.scene) > psnr(images[0], chain.scene) + 4
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_chain_in_one_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "argv", ["see_through.py", "--out", str(tmp_path / "chain.png")])
     assert see_through.main() == 0
     assert (tmp_path / "chain.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_demo_of_training_compares_what_it_trained(tmp_path: Path):
     """At the smallest size, where numbers mean nothing: that the table is that of the trainings' own scores."""
     spec = tmp_path / "small.toml"
@@ -143,7 +143,7 @@ def test_the_demo_of_training_compares_what_it_trained(tmp_path: Path):
     assert Model.open(tmp_path / "released").colours == ("550nm",)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_model_is_trained_behind_a_plate_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Behind a released plate, which has no heights before rounding and stays as it is; what is stopped goes on."""
     spec = tmp_path / "small.toml"

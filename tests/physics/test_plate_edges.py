@@ -209,7 +209,7 @@ def test_errors_that_vanish_lead_to_the_drawn_doe_with_edges():
     np.testing.assert_allclose(zeroth_order(made), zeroth_order(drawn), atol=2e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_gradients_go_through_the_light_of_walls():
     lens, process = small(grid=Grid((32, 32), CELL), aperture=32 * CELL, window=64), Process(LEVELS)
 

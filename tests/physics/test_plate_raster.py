@@ -227,7 +227,13 @@ def random_fields(cells: int, variation: Variation, depth_m: float, margin: int 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n if "half" in n else pytest.param(n, marks=pytest.mark.slow) for n in RANDOM])
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if "half" in n else pytest.param(n, marks=pytest.mark.study if RANDOM[n].cells > CELLS else pytest.mark.slow)
+        for n in RANDOM
+    ],
+)
 def test_random_plates_are_those_of_a_raster_from_near_and_far(name: str):
     """Every cell a level of its own, a hard rim, the automotive window, one plate for 5 cm and for infinity."""
     case = RANDOM[name]
@@ -237,7 +243,7 @@ def test_random_plates_are_those_of_a_raster_from_near_and_far(name: str):
             assert colour.change() > 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_random_plates_with_tilted_walls_are_those_of_a_raster():
     """Walls of 5 degrees are 50 nm wide: the raster has to see into them, so the plate is small, and has no rim."""
     errors = {**SHIFTED, "common_cd_bias_m": 2 * G, "depth_scale": (0.02, -0.01, 0.01, -0.02), "etch_lag": 0.02}

@@ -13,7 +13,7 @@ SLIT = TINY.replace('aperture = "0.1184 mm"', 'aperture = ["0.1184 mm", "0.074 m
 )
 
 
-@pytest.mark.slow
+@pytest.mark.study  # test_mask_apertures.py takes an aperture of any outline the same way
 @pytest.mark.parametrize("samples", ["64", "[64, 40]"])
 def test_a_rectangular_aperture_goes_from_the_spec_to_a_proved_order_and_to_its_light(tmp_path, cli, samples):
     spec, run, order = tmp_path / "slit.toml", tmp_path / "run", tmp_path / "order"

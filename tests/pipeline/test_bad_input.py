@@ -409,12 +409,10 @@ def test_one_flipped_byte_fails_verify_and_is_named(copied, cli):
         path = copied.order / name
         where = int(rng.integers(path.stat().st_size))
         flip(path, where)
-        done = cli("verify", copied.order)
-        assert done.code == 1, (name, where)
-        assert "Traceback" not in done.err
-        assert f"{name}: bytes as in the manifest" in done.err
         told = cli("verify", copied.order, "--json")
-        assert told.code == 1
+        assert told.code == 1, (name, where)
+        assert "Traceback" not in told.err
+        assert f"{name}: bytes as in the manifest" in told.err
         failed = [check for check in json.loads(told.out)["checks"] if check["problems"]]
         assert {check["file"] for check in failed} == {name}
         flip(path, where)

@@ -79,7 +79,7 @@ def test_a_mask_goes_from_the_spec_to_a_proved_order_and_to_its_light(tmp_path, 
     assert all(sum(row["budget"].values()) == pytest.approx(1.0, abs=1e-6) for row in rows)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_light_with_edges_and_the_direct_path_take_a_mask(tmp_path, cli, spec):
     for name, changes in {
         "edges": ['optics.light="edges"'],

@@ -101,7 +101,7 @@ def test_items_of_a_batch_do_not_mix() -> None:
     np.testing.assert_allclose(both[1:], CALL(network, other, psfs(), psfs()), rtol=1e-4, atol=2e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_checkpointing_changes_memory_and_no_number() -> None:
     network = Network.make(SMALL, 1)
 

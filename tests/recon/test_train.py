@@ -76,7 +76,7 @@ def test_optics_and_network_learn_together(joint: Trainer) -> None:
     assert not alike(numbers(state.free), free)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_in_turns_one_moves_and_the_other_stays_to_the_bit() -> None:
     """The network alone lowers the loss, and so does the optics alone."""
     made = trainer(*PLAIN, *LEARNING, 'train.mode="alternating"', "train.period=3")
@@ -191,7 +191,7 @@ class Distance(eqx.Module):
         return self.value + 0 * jnp.mean(picture - reference, axis=(1, 2, 3))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_errors_of_a_process_and_the_perceptual_term() -> None:
     changes = ("train.fabricated=true", "process.errors.overlay_y={sigma='0.5 um'}", "train.perceptual=0.5")
     made = trainer(*PLAIN, *changes, perceptual=Distance(jnp.float32(3)))
@@ -208,7 +208,7 @@ def test_errors_of_a_process_and_the_perceptual_term() -> None:
     assert line["loss"] == pytest.approx(parts["l1"] + parts["masked"] + 0.5 * 3, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("changes", [('train.precision="mixed"',), ("train.checkpointing=true",)])
 def test_other_ways_to_the_same_loss(changes: tuple[str, ...]) -> None:
     """The whole network, Wiener blocks and all: half precision within 1 %, computing twice to the rounding."""

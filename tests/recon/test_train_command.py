@@ -219,7 +219,7 @@ def test_what_is_finished_stays(run: Path, images: Path, whole: Path):
     assert content(whole) == before
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
     rows = [ValidationRow(f"{k}.png: 20 dB", *rng.random((3, 3, 300, 200), np.float32)) for k in range(6)]
     save(plot_validation(rows, "small, step 3", "words " * 30), tmp_path / "a.png")
@@ -241,7 +241,7 @@ def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
         plot_training([], "small")
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_trained_plate_can_be_drawn(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -253,7 +253,7 @@ def test_the_trained_plate_can_be_drawn(
     assert source["level_map_sha256"] == read_level_map(whole / "level_map.npz").digest
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_training_without_a_plate_has_no_masks(
     run: Path, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -262,7 +262,7 @@ def test_a_training_without_a_plate_has_no_masks(
     assert "must hold a plate, level_map.npz" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_without_a_folder_the_model_is_what_is_left(run: Path, images: Path, whole: Path):
     """The same training in memory, but for a shorter one that an option asks for."""
     design = open_design(run, levels=4)
@@ -352,7 +352,7 @@ def test_stopped_in_between(
     assert content(tmp_path / "out") == content(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_stopped_at_every_few_writes(
     run: Path, images: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -400,7 +400,7 @@ sys.exit(exit_code(lambda: train(open_design(run, False), images, out)))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 130), (signal.SIGKILL, -9)])
 def test_a_process_that_is_told_to_end(
     run: Path, images: Path, whole: Path, tmp_path: Path, compiled_once: Path, kind: signal.Signals, code: int
@@ -450,7 +450,7 @@ def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Pa
     assert content(tmp_path / "out") == content(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_numbers_that_are_not_finite(run: Path, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The checkpoint before them is kept, and its place is told."""
     step = Trainer.step
@@ -535,7 +535,7 @@ def test_scikit_images_pictures_are_enough():
     assert len(split.training) == len(split.held_out) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("change", "height", "continuous", "network"),
     [

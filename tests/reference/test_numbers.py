@@ -144,12 +144,12 @@ def found_in(folder: Path) -> set[str]:
     return {name for path in folder.rglob("metrics.json") for name in names_in(json.loads(path.read_text()))}
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_every_number_of_a_run_is_defined(folder: Path) -> None:
     assert {name for name in found_in(folder) if number(name) is None} == set()
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_every_definition_is_of_a_number_that_a_run_has(folder: Path) -> None:
     known, found = metrics_numbers(), found_in(folder)
     found |= {f"{name.removesuffix('_rad')}_m" for name in found if name.endswith("_rad") and name not in known}
@@ -161,7 +161,7 @@ def test_every_definition_is_of_a_number_that_a_run_has(folder: Path) -> None:
     assert {"on_target", "uniformity_error", "contrast", "focus_width"} <= found
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_main_numbers_of_every_task_are_numbers_of_its_metrics(folder: Path) -> None:
     """What `runs`, `compare` and the last lines of commands tell."""
     aims = {
@@ -178,7 +178,7 @@ def test_the_main_numbers_of_every_task_are_numbers_of_its_metrics(folder: Path)
         assert all(number(one.key) is not None for one in told if one.key != "concentration_over_bound")
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_twins_are_one_number(folder: Path) -> None:
     """A name has one value in a row: shares of the budget are the numbers beside it."""
     for row in json.loads((folder / "see_through" / "metrics.json").read_text())["psf"]:
@@ -189,7 +189,7 @@ def test_twins_are_one_number(folder: Path) -> None:
         assert row.get("far_spot", budget["far_spot"]) == budget["far_spot"]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_plate_as_drawn_has_a_relative_strehl_ratio_of_one_and_its_own_spot(folder: Path) -> None:
     rows = json.loads((folder / "see_through_fabricated" / "metrics.json").read_text())["nominal"]
     # Means of float32 transmissions.
@@ -197,7 +197,7 @@ def test_a_plate_as_drawn_has_a_relative_strehl_ratio_of_one_and_its_own_spot(fo
     assert all(row.get("far_spot", 0.0) < 0.95 for row in rows)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_numbers_of_a_study_are_those_of_metrics(folder: Path) -> None:
     """`on_target` of a draw is that of the table in metrics.json."""
     for name, key in (("orders", "orders"), ("areas", "area")):
@@ -207,7 +207,7 @@ def test_numbers_of_a_study_are_those_of_metrics(folder: Path) -> None:
             assert record[plate][0]["on_target"] == min(table["on_target"] for table in tables)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_columns_of_tables_are_defined(folder: Path) -> None:
     own = OTHER_GROUPS[0].numbers
     for path in folder.rglob("*.csv"):
@@ -217,7 +217,7 @@ def test_columns_of_tables_are_defined(folder: Path) -> None:
             assert unknown - {"phase_error_deg"} == set(), path
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_results_of_a_study_are_defined(folder: Path) -> None:
     asked: dict[str, Any] = {"process": "contact_aligner", "draws": 2, "limits": ["strehl >= 0.5"], "budget": "depth"}
     result = tolerance(folder / "see_through", **asked, workers=1)

@@ -55,7 +55,7 @@ def family() -> ExplanationSet:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("plot", [plot_fitted_psfs, plot_estimates, plot_check])
 def test_every_picture_is_whole_and_repeatable(result: Calibration, plot: Callable[..., Figure]):
     require_whole(plot(result))
@@ -63,7 +63,7 @@ def test_every_picture_is_whole_and_repeatable(result: Calibration, plot: Callab
     require_place_of_axes(lambda ax: plot(result, ax))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_explanations_are_drawn_also_if_there_are_none():
     without = family()._replace(singles=[], pairs=[])
     for one in (family(), without):
@@ -72,7 +72,7 @@ def test_explanations_are_drawn_also_if_there_are_none():
     assert png_bytes(plot_explanations(family())) != png_bytes(plot_explanations(without))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_difference_is_seen(result: Calibration):
     """A bright pixel that the model lacks makes a red dot."""
     at = result.fit.at

@@ -92,7 +92,7 @@ def test_psfs_of_the_direct_path(propagation: Any):
     check(lambda height: psf(height, fine, NEAR_M, propagation=propagation).energy, wrapped_map(64), 2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_doe_as_fabricated():
     """Its PSF, 0th order and overlap with the design as functions of a number (metres) that moves several errors."""
     process, nominal = Process(LEVELS), as_fabricated(LEVEL, ONE, Process(LEVELS), variation_of(1, {}))
@@ -155,7 +155,9 @@ def layers(rng: np.random.Generator) -> tuple[Any, ...]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", [*(pytest.param(model, marks=pytest.mark.slow) for model in MODELS[:-1]), MODELS[-1]])
+@pytest.mark.parametrize(
+    "model", [*(pytest.param(model, marks=pytest.mark.study) for model in MODELS[:-1]), MODELS[-1]]
+)
 def test_image_formation(rng: np.random.Generator, model: Model):
     """PSFs, images, mask and depth at once; from the bank through `Optics.of`, as a user goes."""
     bank = psf(HEIGHT_M, CAMERA, DEPTHS_M)

@@ -29,7 +29,7 @@ def test_a_shipped_table_is_the_computed_one(key: WidthKey):
     np.testing.assert_allclose(shipped_tables()[key], key.computed(), atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_example_for_the_fab_takes_its_tables_from_the_shipped_file(monkeypatch: pytest.MonkeyPatch):
     """As drawn, as fabricated, and while its heights are sought."""
     spec = doedesign.load_spec(EXAMPLES / "quick.toml", ["optics.light=edges"])
