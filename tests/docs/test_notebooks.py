@@ -14,11 +14,11 @@ EXAMPLES = ROOT / "examples"
 # Pictures and tables that a reader must see, at least.
 SHOWN = {"tutorial": 8, "cookbook": 12}
 
-pytestmark = pytest.mark.slow
+# The documentation's commands do what the tutorial does; doedesign/test_templates.py has what the cookbook has.
+pytestmark = pytest.mark.study
 
 
-# What the tutorial does, the documentation's commands do.
-@pytest.mark.parametrize("name", [pytest.param("tutorial", marks=pytest.mark.study), "cookbook"])
+@pytest.mark.parametrize("name", SHOWN)
 # ipykernel leaves sockets to the interpreter's end, which pytest would take for this test's.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_notebook_runs_and_shows_its_results(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -37,7 +37,9 @@ SESSIONS = (
 CHANGES = ("train.steps=2", "train.validation=1", "network.depth=1", "network.width=3")
 SMALL = [word for change in CHANGES for word in ("--set", change)]
 # What a full design of a template or a training takes minutes for is cut short; the command is otherwise as it stands.
+DRAWS = "4"
 SHORT = {
+    "calibrate": ["--errors", "common_depth_scale"],
     "optimize": ["--set", "optimize.steps=2"],
     "train": SMALL,
     "evaluate": [*SMALL, "--pairs", "2"],
@@ -84,7 +86,7 @@ def test_commands_run(pages: tuple[str, ...], folder: Path):
         words = shlex.split(line)
         if words[0] == "doedesign" and words[1:] != ["--version"]:
             with contextlib.chdir(folder):
-                assert main(words[1:] + (SHORT[words[1]] if takes_long(words) else [])) == 0, line
+                assert main(shortened(words[1:])) == 0, line
         elif words[:3] == ["python", "-m", "pip"]:
             pass  # in a test of the release
         elif words[0] == "jupytext":
@@ -143,10 +145,16 @@ def test_the_site_builds_strictly_and_fetches_nothing(tmp_path: Path):
         assert not re.findall(r"(?:url\(|@import )[\"']?(?:https?:)?//", sheet.read_text("utf-8")), sheet
 
 
-def takes_long(words: list[str]) -> bool:
-    """Whether a command trains, or optimises for many steps."""
-    optimises = words[1] == "optimize" and takes_steps(words[2].removesuffix(".toml"))
-    return optimises or words[1] == "train" or "--train" in words
+def shortened(command: list[str]) -> list[str]:
+    """A command that trains, fits photographs or takes many steps or draws, cut short; any other as it is."""
+    name, about = command[:2] if len(command) > 1 else (*command, "")
+    if "--draws" in command:
+        where = command.index("--draws") + 1
+        return [*command[:where], DRAWS, *command[where + 1 :]]
+    optimises = name == "optimize" and takes_steps(about.removesuffix(".toml"))
+    if optimises or name in ("train", "calibrate") or "--train" in command:
+        return command + SHORT[name]
+    return command
 
 
 def takes_steps(name: str) -> bool:

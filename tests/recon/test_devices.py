@@ -148,7 +148,7 @@ def ended(processes: list[subprocess.Popen[str]], code: int) -> list[bool]:
     return ["written: 0" not in out.splitlines() for out, _ in said]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_two_hosts_train_as_one_and_stop_together(tmp_path: Path) -> None:
     run, images = finished_run(tmp_path, SPEC), tmp_path / "images"
     images.mkdir()
