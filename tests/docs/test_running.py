@@ -33,6 +33,8 @@ SESSIONS = (
     ("docs/tasks/hdr.md", "docs/tasks/wide-aperture.md"),
     ("docs/tasks/tables.md",),
 )
+# Whole plates of many million cells, and networks behind them.
+WHOLE = (("docs/tasks/hdr.md", "docs/tasks/wide-aperture.md"),)
 # Compiling a large network takes longer than a few steps of a small one.
 CHANGES = ("train.steps=2", "train.validation=1", "network.depth=1", "network.width=3")
 SMALL = [word for change in CHANGES for word in ("--set", change)]
@@ -78,7 +80,10 @@ def test_every_page_with_commands_runs():
     assert left_out <= {"CONTRIBUTING.md"}
 
 
-@pytest.mark.parametrize("pages", SESSIONS, ids=lambda pages: pages[0])
+@pytest.mark.parametrize(
+    "pages",
+    [pytest.param(pages, marks=pytest.mark.study if pages in WHOLE else (), id=pages[0]) for pages in SESSIONS],
+)
 def test_commands_run(pages: tuple[str, ...], folder: Path):
     found = [(page, block) for page in pages for block in blocks("sh") if block.page == page]
     lines = dict.fromkeys(line for _, block in found for line in block.lines)  # what two pages have runs once
