@@ -122,7 +122,7 @@ def test_the_estimate_predicts_the_fitted_images(loop: Calibration):
 @pytest.mark.slow
 def test_without_relief_nothing_is_claimed(tmp_path: Path):
     """A flat plate has no etched edge: what is known afterwards is what was believed before."""
-    result = measured(tmp_path, *small(64, relief=0.0), {})
+    result = measured(tmp_path, *small(relief=0.0), {})
     np.testing.assert_allclose(result.posterior.ratio, 1.0, atol=1e-3)
     assert result.explained
     assert not any(result.determined.values())
@@ -206,8 +206,8 @@ def test_a_process_that_is_something_else_is_not_explained(tmp_path: Path):
 @pytest.mark.slow
 def test_a_picture_the_wrong_way_up_is_noticed(tmp_path: Path):
     design, process = small()
-    lights = [np.rot90(light, 2).copy() for light in light_of(design, process, {}, (NEAR_M,))]
-    path = photograph(tmp_path, lights, (NEAR_M,))
+    lights = [np.rot90(light, 2).copy() for light in light_of(design, process, {}, (NEAR_M, FAR_M))]
+    path = photograph(tmp_path, lights, (NEAR_M, FAR_M))
     result = calibrate(design, path, process=process, evaluations=0)
     assert any("turned left by 2 more quarter turns" in remark for remark in result.remarks)
 
