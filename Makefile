@@ -25,7 +25,7 @@ test: $(VENV)/.dev
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "slow and not study" --durations=40
 
-# Minutes each, of what shorter tests show in part: before a release.
+# Tests that take minutes, or repeat for many plates what a shorter one shows once: before a release.
 studies: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m study --durations=0
 

@@ -33,12 +33,12 @@ SESSIONS = (
     ("docs/tasks/hdr.md", "docs/tasks/wide-aperture.md"),
     ("docs/tasks/tables.md",),
 )
-# Whole plates of many million cells with networks behind them, and every network of a table.
-WHOLE = (("docs/tasks/hdr.md", "docs/tasks/wide-aperture.md"), ("docs/tasks/tables.md",))
+# Those with plates of many million cells and networks behind them, or with every network of a table.
+LENGTHY = ("docs/tasks/hdr.md", "docs/tasks/tables.md")
 # Compiling a large network takes longer than a few steps of a small one.
 CHANGES = ("train.steps=2", "train.validation=1", "network.depth=1", "network.width=3")
 SMALL = [word for change in CHANGES for word in ("--set", change)]
-# What a full design of a template or a training takes minutes for is cut short; the command is otherwise as it stands.
+# What a full design, a training, a study or a fit takes minutes for is cut short; else commands are as they stand.
 DRAWS = "4"
 SHORT = {
     "calibrate": ["--errors", "common_depth_scale"],
@@ -82,7 +82,7 @@ def test_every_page_with_commands_runs():
 
 @pytest.mark.parametrize(
     "pages",
-    [pytest.param(pages, marks=pytest.mark.study if pages in WHOLE else (), id=pages[0]) for pages in SESSIONS],
+    [pytest.param(pages, marks=pytest.mark.study if pages[0] in LENGTHY else (), id=pages[0]) for pages in SESSIONS],
 )
 def test_commands_run(pages: tuple[str, ...], folder: Path):
     found = [(page, block) for page in pages for block in blocks("sh") if block.page == page]
@@ -152,11 +152,11 @@ def test_the_site_builds_strictly_and_fetches_nothing(tmp_path: Path):
 
 def shortened(command: list[str]) -> list[str]:
     """A command that trains, fits photographs or takes many steps or draws, cut short; any other as it is."""
-    name, about = command[:2] if len(command) > 1 else (*command, "")
+    name = command[0]
     if "--draws" in command:
         where = command.index("--draws") + 1
         return [*command[:where], DRAWS, *command[where + 1 :]]
-    optimises = name == "optimize" and takes_steps(about.removesuffix(".toml"))
+    optimises = name == "optimize" and takes_steps(command[1].removesuffix(".toml"))
     if optimises or name in ("train", "calibrate") or "--train" in command:
         return command + SHORT[name]
     return command

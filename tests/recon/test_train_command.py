@@ -219,7 +219,7 @@ def test_what_is_finished_stays(run: Path, images: Path, whole: Path):
     assert content(whole) == before
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
     rows = [ValidationRow(f"{k}.png: 20 dB", *rng.random((3, 3, 300, 200), np.float32)) for k in range(6)]
     save(plot_validation(rows, "small, step 3", "words " * 30), tmp_path / "a.png")
@@ -352,7 +352,7 @@ def test_stopped_in_between(
     assert content(tmp_path / "out") == content(whole)
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_stopped_at_every_few_writes(
     run: Path, images: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -450,7 +450,7 @@ def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Pa
     assert content(tmp_path / "out") == content(whole)
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_numbers_that_are_not_finite(run: Path, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The checkpoint before them is kept, and its place is told."""
     step = Trainer.step

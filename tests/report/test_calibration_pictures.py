@@ -63,7 +63,7 @@ def test_every_picture_is_whole_and_repeatable(result: Calibration, plot: Callab
     require_place_of_axes(lambda ax: plot(result, ax))
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_explanations_are_drawn_also_if_there_are_none():
     without = family()._replace(singles=[], pairs=[])
     for one in (family(), without):
