@@ -41,7 +41,7 @@ SMALL = [word for change in CHANGES for word in ("--set", change)]
 # What a full design, a training, a study or a fit takes minutes for is cut short; else commands are as they stand.
 DRAWS = "4"
 SHORT = {
-    "calibrate": ["--errors", "common_depth_scale"],
+    "calibrate": ["--errors", "common_depth_scale", "--evaluations", "0"],
     "optimize": ["--set", "optimize.steps=2"],
     "train": SMALL,
     "evaluate": [*SMALL, "--pairs", "2"],
@@ -157,9 +157,8 @@ def shortened(command: list[str]) -> list[str]:
         where = command.index("--draws") + 1
         return [*command[:where], DRAWS, *command[where + 1 :]]
     optimises = name == "optimize" and takes_steps(command[1].removesuffix(".toml"))
-    if optimises or name in ("train", "calibrate") or "--train" in command:
-        return command + SHORT[name]
-    return command
+    fits = name == "calibrate" and command[-1].endswith(".toml")
+    return command + (SHORT[name] if optimises or fits or name == "train" or "--train" in command else [])
 
 
 def takes_steps(name: str) -> bool:
