@@ -65,8 +65,11 @@ hypothesis.settings.load_profile("repeatable")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile without optimisation where most programs run once; the long tests run the code that users run."""
-    if config.option.markexpr != "slow":
+    """Compile without optimisation where long tests are left out: most programs run once there.
+
+    The long tests run the code that users run; `test_long_tests_run_what_users_run` holds this.
+    """
+    if "not slow" in config.option.markexpr:
         flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
         flags += ["--xla_llvm_disable_expensive_passes=true", "--xla_cpu_use_fusion_emitters=false"]
         os.environ["XLA_FLAGS"] = " ".join(flags).strip()

@@ -33,8 +33,9 @@ SESSIONS = (
     ("docs/tasks/hdr.md", "docs/tasks/wide-aperture.md"),
     ("docs/tasks/tables.md",),
 )
-# Those with plates of many million cells and networks behind them, or with every network of a table.
-LENGTHY = ("docs/tasks/hdr.md", "docs/tasks/tables.md")
+# Those with plates of many million cells and networks behind them, with every network of a table, or with one design
+# after the other, of templates that have tests of their own.
+LENGTHY = ("docs/tasks/hdr.md", "docs/tasks/tables.md", "docs/tasks/foci.md")
 # Compiling a large network takes longer than a few steps of a small one.
 CHANGES = ("train.steps=2", "train.validation=1", "network.depth=1", "network.width=3")
 SMALL = [word for change in CHANGES for word in ("--set", change)]
@@ -105,7 +106,14 @@ def test_commands_run(pages: tuple[str, ...], folder: Path):
             assert words[0] in PROGRAMS or words[1:] == ["--version"], line
 
 
-@pytest.mark.parametrize("page", sorted({block.page for block in blocks("python") if block.page != "CONTRIBUTING.md"}))
+PYTHON_PAGES = sorted({block.page for block in blocks("python")} - {"CONTRIBUTING.md"})
+
+
+@pytest.mark.parametrize(
+    "page",
+    # The session of that page has a test of its own, `tests/test_session.py`.
+    [pytest.param(page, marks=pytest.mark.study if page == "docs/notebooks.md" else ()) for page in PYTHON_PAGES],
+)
 def test_python_of_a_page_runs(page: str, tmp_path: Path):
     """The blocks of a page one after another, in a process of their own (CONTRIBUTING.md: test_additions.py)."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")

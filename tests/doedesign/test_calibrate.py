@@ -119,7 +119,7 @@ def test_the_estimate_predicts_the_fitted_images(loop: Calibration):
     assert loop.process.spreads["common_depth_scale"].sigma < 0.001
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_without_relief_nothing_is_claimed(tmp_path: Path):
     """A flat plate has no etched edge: what is known afterwards is what was believed before."""
     result = measured(tmp_path, *small(relief=0.0), {})
@@ -193,7 +193,7 @@ def test_a_known_brightness_measures_the_throughput(tmp_path: Path):
     assert not result.left_out  # there is no other image
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_process_that_is_something_else_is_not_explained(tmp_path: Path):
     """Corners were rounded, and nobody asked: the fit must not pass the errors it finds off as sure."""
     design, process = small()
@@ -203,7 +203,7 @@ def test_a_process_that_is_something_else_is_not_explained(tmp_path: Path):
     assert wrong.posterior.inflation > 1.2
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_picture_the_wrong_way_up_is_noticed(tmp_path: Path):
     design, process = small()
     lights = [np.rot90(light, 2).copy() for light in light_of(design, process, {}, (NEAR_M, FAR_M))]
@@ -259,7 +259,7 @@ def test_slopes_of_the_objective(objective: FitObjective):
         assert gradient[k] == pytest.approx((high - low) / 0.01, rel=0.02, abs=0.02 * np.abs(gradient).max())
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_exact_gradient_agrees(objective: FitObjective):
     """Backwards through light and plate: the same slope as central differences."""
     weights = tuple(measured_weights(target, 0.01) for target in objective.targets)

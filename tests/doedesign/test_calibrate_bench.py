@@ -119,7 +119,7 @@ def test_errors_are_found_with_a_camera_askew(tmp_path: Path):
     assert (posterior.geometry_sigma[:3] < 0.003).all()  # a tenth of a pixel at the window's corner
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_camera_taken_for_upright_spoils_the_errors(tmp_path: Path):
     """The same images, and a bench that is said to be exact: the promise is broken, and no standard deviation lies."""
     exact = '[camera]\nrotation_sigma = "0 deg"\nscale_sigma = 0.0\ndistortion_sigma = 0.0'

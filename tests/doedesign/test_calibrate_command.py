@@ -105,7 +105,7 @@ def test_the_files_say_what_was_found(run: Path, fitted: tuple[int, str, str]):
     assert names - {"run", "measurement_sha256"} == set(defined)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_estimate_is_a_process_like_any_other(run: Path, fitted: tuple[int, str, str]):
     folder = run / "calibration"
     record = json.loads((folder / "calibration.json").read_text())

@@ -23,7 +23,7 @@ def spec(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_every_strategy_is_judged_alike(spec: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     compare_quantization.run(spec, (2, 8), 60, tmp_path / "out")
     rows = list(csv.DictReader((tmp_path / "out" / "quantization.csv").read_text().splitlines()))

@@ -30,7 +30,7 @@ def test_plates_of_a_process_without_errors_are_as_drawn(spec: Path):
     assert found.median_zeroth_order == pytest.approx(found.drawn_zeroth_order, rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_every_design_meets_every_process(spec: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "robust.csv"
     found = compare_robust.run(spec, 24, 2, ["contact_aligner", "direct_write"], out)

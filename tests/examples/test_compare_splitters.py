@@ -27,7 +27,7 @@ def test_plates_of_a_process_without_errors_are_as_drawn(tmp_path: Path, monkeyp
     assert unequal[0] < 0.02  # the lens of the camera sees whole periods, and all levels are there
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_both_designs_meet_every_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

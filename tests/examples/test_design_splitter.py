@@ -63,7 +63,7 @@ def test_the_cell_that_it_made_follows_the_rule():
         assert np.array_equal(part, design_splitter.painted(part))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_cell_that_it_made_has_the_score_that_is_stated():
     """Both solvers, which share nothing but the case."""
     pytest.importorskip("fmmax")

@@ -63,7 +63,7 @@ def undescribed(folder: Path) -> list[str]:
     return missing
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_every_command_runs_with_its_defaults(tmp_path: Path):
     assert set(every_command.every_command(tmp_path)) == NAMES
     run = tmp_path / "runs" / "quick"

@@ -79,7 +79,7 @@ def test_wafers_of_a_fab_share_its_errors_and_draw_their_own():
     assert np.abs(first.place_m - second.place_m).min() > 0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_second_wafer_is_nearer_to_the_design(tmp_path: Path):
     """The whole loop for one fab, on a quarter of the quick example's cells."""
     text = QUICK.read_text()

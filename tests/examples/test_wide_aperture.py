@@ -64,7 +64,7 @@ def test_the_spec_says_what_is_designed():
     assert spec.objectives[0].name == "filtered_error"
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_whole_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With smaller apertures, few steps and scenes: every table and picture, and the same again from files."""
     small = (

@@ -33,7 +33,7 @@ def test_a_sample_of_the_defects(base, tmp_path, defect):
     assert "\n" not in found.line
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_larger_sample_of_the_defects(base, tmp_path):
     """The campaign plants all of them."""
     chosen = [defect for defect in DEFECTS if not defect.meaningful] + random.Random(17).sample(DEFECTS, 30)

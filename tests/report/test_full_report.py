@@ -49,7 +49,7 @@ def fill_in(folder: Path) -> None:
     (folder / "filled.json").write_text(json.dumps(record))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_quick_report_is_small_and_complete(folder: Path):
     path = folder / "runs" / "quick" / "report.html"
     assert path.stat().st_size <= MOST_BYTES
@@ -67,7 +67,7 @@ def test_the_quick_report_is_small_and_complete(folder: Path):
     assert "doedesign verify masks/quick" in text
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_the_quick_report_opens_and_everybody_can_read_it(folder: Path):
     with chromium() as browser:
