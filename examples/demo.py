@@ -23,6 +23,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import jax
+
 from doedesign.cli import exit_code
 from doedesign.design.design import Design
 from doedesign.lab.order import write_masks
@@ -38,6 +40,7 @@ from fab.units import format_length
 HERE = Path(__file__).parent
 QUICK, FULL = HERE / "quick.toml", HERE / "automotive.toml"
 
+_KEPT = "JAX_COMPILATION_CACHE_DIR"
 _BEGUN = time.monotonic()
 
 
@@ -55,11 +58,12 @@ def demo(first: Path = QUICK, main: Path | None = FULL, runs: Path = Path("runs"
     """
     if main is None:
         return made(first, runs, masks)
-    with optimised_beside(main, runs) as wait_for_main:
-        print(made(first, runs, masks), flush=True)
-        say(f"{main}, which was begun meanwhile:")
-        wait_for_main()
-    return made(main, runs, masks)
+    with programs_kept():
+        with optimised_beside(main, runs) as wait_for_main:
+            print(made(first, runs, masks), flush=True)
+            say(f"{main}, which was begun meanwhile:")
+            wait_for_main()
+        return made(main, runs, masks)
 
 
 def made(spec_path: Path, runs: Path, masks: Path) -> str:
@@ -101,6 +105,22 @@ def made(spec_path: Path, runs: Path, masks: Path) -> str:
 def say(text: str) -> None:
     """Print a message with the time since the demo began."""
     print(f"  [{time.monotonic() - _BEGUN:3.0f} s] {text}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def programs_kept() -> Iterator[None]:
+    """Keep what either process compiles for the other, as long as the demo lasts."""
+    if _KEPT in os.environ:
+        yield
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ[_KEPT] = folder
+        jax.config.update("jax_compilation_cache_dir", folder)
+        try:
+            yield
+        finally:
+            jax.config.update("jax_compilation_cache_dir", None)
+            del os.environ[_KEPT]
 
 
 @contextmanager

@@ -143,18 +143,18 @@ def _write(
     lens = psf(flat, depths=depths, field_rad=field)
     lens_transfer = mtf(flat, depths=depths)
     metrics: dict[str, Any] = {"lens": camera.lens_text, "light": camera.light}
-    for name, optic in optics.items():
-        bank = banks[name]
+    within = encircled_curves([*(banks[name] for name in optics), lens])
+    for (name, optic), inside in zip(optics.items(), within[:-1], strict=True):
+        bank, curves = banks[name], [inside, within[-1]]
         write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name, "lens": camera.lens_text})
         whose = f"{run.spec.name}, {name.replace('_', ' ')}"
         save(plot_psfs(bank, camera, near, far, title=whose), folder / f"{name}_psf.png")
         transfer = mtf(optic, depths=depths)
         save(plot_mtf(transfer, camera, near, far, lens_transfer, title=whose), folder / f"{name}_mtf.png")
-        within = encircled_curves([bank, lens])
-        picture = plot_encircled(bank, camera, near, far, lens, title=whose, curves=within)
+        picture = plot_encircled(bank, camera, near, far, lens, title=whose, curves=curves)
         save(picture, folder / f"{name}_encircled.png")
         (folder / f"{name}_mtf.csv").write_bytes(mtf_csv(transfer, lens_transfer).encode())
-        (folder / f"{name}_encircled.csv").write_bytes(encircled_csv(bank, within, camera).encode())
+        (folder / f"{name}_encircled.csv").write_bytes(encircled_csv(bank, curves, camera).encode())
         metrics[name] = design_metrics(optic, bank, near, lens)
     # Of the map itself; the heights before rounding have other walls.
     metrics["quantised"] = with_verdict(metrics["quantised"], certified)

@@ -111,9 +111,10 @@ def encircled_radii_m(bank: "sim.psf_bank.PsfBank") -> Float[np.ndarray, " r"]:
 
 
 def encircled_curves(banks: Sequence["sim.psf_bank.PsfBank"]) -> list[Float[np.ndarray, "w d r"]]:
-    """Light of every one of `banks` within the `encircled_radii_m` of the first."""
-    radii = encircled_radii_m(banks[0])
-    return [np.asarray(encircled_energy(np.asarray(one.energy), one.pixel_m, radii)) for one in banks]
+    """Light of every one of `banks`, of one window and the same colours, within `encircled_radii_m` of the first."""
+    energy = np.concatenate([np.asarray(one.energy) for one in banks], axis=1)
+    curves = np.asarray(encircled_energy(energy, banks[0].pixel_m, encircled_radii_m(banks[0])))
+    return np.split(curves, np.cumsum([len(one.depths_m) for one in banks])[:-1], axis=1)
 
 
 def _heading(what: str, whose: str) -> str:
