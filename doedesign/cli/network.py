@@ -199,7 +199,7 @@ def evaluate(
     seed: int = 0,
     reflect: Flag = False,
     robust: Path | None = None,
-    process: Path | None = None,
+    process: str | None = None,
     draws: int = 4,
     method: Texts = (),
     lpips_weights: Files = (),
@@ -230,7 +230,8 @@ def evaluate(
         seed: Seed of the pairs.
         reflect: Mirror scenes beyond the edges of a capture, as in training, instead of letting them go on.
         robust: Run folder of a robust design of the same camera, for rows of its own in table 2.
-        process: TOML file with a [process] table for the plates as fabricated; the run's own by default.
+        process: TOML file with a [process] table, or the name of a stock process, for the plates as fabricated; the
+            run's own by default.
         draws: Plates as fabricated, over which the pairs are shared out.
         method: A program to score, "NAME=COMMAND {in} {out}"; NAME:scene= or NAME:plate= shows it something else.
         lpips_weights: Files with the weights of LPIPS; without them there is no such column.
