@@ -155,14 +155,11 @@ def single(ax: "Axes | None", size_in: tuple[float, float], title: str = "", not
 
 def png_bytes(drawn: "Axes | FigureBase") -> bytes:
     """PNG file of the whole figure that a picture was drawn on; a fresh drawing of the same gives the same bytes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     stream = io.BytesIO()
     figure: Any = drawn.get_figure(root=True)
     with _house_style():
-        # `savefig` would draw everything twice, once for the layout, which drawing makes itself. The default metadata
-        # would name the version of matplotlib.
-        FigureCanvasAgg(figure).print_png(stream, metadata={"Software": None})
+        # The default metadata would name the version of matplotlib.
+        figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()
 
 

@@ -107,8 +107,3 @@ def test_a_capture_and_its_reconstruction(design: dd.Design, tmp_path: Path):
     picture = dd.Model.released().reconstruct(shot)
     assert np.isfinite(np.asarray(picture.light)).all()
     picture.plot()
-
-
-def test_long_tests_run_what_users_run():
-    """Without this, tests of the long tier once compiled for quick tests, and took twice as long."""
-    assert "backend_optimization_level" not in os.environ.get("XLA_FLAGS", "")
