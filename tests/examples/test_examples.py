@@ -155,13 +155,15 @@ def test_demo_takes_no_other_order_for_its_own(
     leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.runs.psfs)
     leave_out_report(monkeypatch, demo)
     runs, masks = tmp_path / "runs", tmp_path / "masks"
+    # Where the tests run, `make demo` may have left a masks/quick of its own.
+    runs.mkdir()
+    monkeypatch.chdir(runs)
     demo.made(small, runs, masks)
     run, order = runs / "quick", masks / "quick"
     assert demo.is_drawn(open_design(run), order)
     assert main(["masks", str(run), "--levels", "8", "--out", str(order)]) == 0
     assert not demo.is_drawn(open_design(run), order)
     # PSFs that were computed without the masks are not those of what was drawn.
-    monkeypatch.chdir(tmp_path / "runs")
     assert main(["psf", "quick"]) == 0
     assert not (run / "psf" / "from_masks.exr").exists()
     demo.made(small, runs, masks)
