@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 import optax
@@ -29,7 +30,7 @@ from doedesign.design.optimize import (
     optimiser_of,
     step_inputs,
 )
-from doedesign.design.problem import losses, problem_of, view_of
+from doedesign.design.problem import losses, problem_of, value_and_slope
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec, load_spec
 from sim.optic import HeightOptic
@@ -89,16 +90,22 @@ def seconds(course: Course) -> Iterator[float | Outcome]:
     problem, scene = problem_of(spec, {})
     first = initial_state(spec, problem, scene, {}, lambda path: np.load(path, allow_pickle=False)).parameters
 
-    def loss(parameters: Any, problem: Any, look: Any, rounding: Any) -> Any:
-        return losses(problem, view_of(problem, problem.parametrization.height_of(parameters, rounding), look))[0]
-
-    def update(inputs: Any, state: Any) -> Any:
+    def moved(inputs: Any, state: Any) -> Any:
+        parametrization, rounding, slope = inputs
         parameters, adam = state
-        found, gradient = jax.value_and_grad(loss)(parameters, *inputs)
-        moves, adam = optimiser.update(gradient, adam)
-        return (optax.apply_updates(parameters, moves), adam), found
+        back = jax.vjp(lambda parameters: parametrization.height_of(parameters, rounding), parameters)[1]
+        moves, adam = optimiser.update(back(slope)[0], adam)
+        return optax.apply_updates(parameters, moves), adam
 
-    step_once, state, taken = compiled_step(update), (first, optimiser.init(first)), []
+    move = compiled_step(moved)
+    height_of = eqx.filter_jit(problem.parametrization.height_of)
+
+    def step_once(inputs: Any, state: Any) -> Any:
+        problem, look, rounding = inputs
+        found, _, slope = value_and_slope(problem, height_of(state[0], rounding), look)
+        return move((problem.parametrization, rounding, slope), state), found
+
+    state, taken = (first, optimiser.init(first)), []
     for step in range(spec.optimize.steps):
         start = time.perf_counter()
         state, found = step_once(step_inputs(spec, problem, scene, step), state)

@@ -411,9 +411,13 @@ def source_path_m(
     sensor at distance d. The linear path of field angles (y, x), the tilt that moves the image, is removed: the window
     follows the chief ray.
     """
-    y = camera.grid.axis_m("y")[:, None]
-    x = camera.grid.axis_m("x")[None, :]
-    path = path_at_m(camera, y, x, depth_m, field_rad)
+    y, x = (camera.grid.axis_m(axis) for axis in ("y", "x"))
+    if any(field_rad):
+        path = path_at_m(camera, y[:, None], x, depth_m, field_rad)
+    else:  # the same in all four quarters, to the last bit
+        across_y, across_x = (np.abs(np.arange(1 - len(axis), len(axis), 2)) // 2 for axis in (y, x))
+        quarter = path_at_m(camera, y[len(y) // 2 :, None], x[len(x) // 2 :], depth_m)
+        path = quarter[across_y[:, None], across_x]
     path.setflags(write=False)
     return path
 

@@ -3,11 +3,9 @@
 # Abstract fields become fields, or properties, of subclasses.
 # pyright: reportIncompatibleVariableOverride=false
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -22,6 +20,7 @@ from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, p
 from sim.optic import ON_AXIS, CellOptic, Optic, Propagation
 from sim.propagation.farfield import FarField
 from sim.rigorous.edge_optic import optic_as_drawn
+from sim.threads import at_once
 from sim.tracing import compiled_quickly, in_jit, is_traced, on_host, stacked
 
 if TYPE_CHECKING:
@@ -268,56 +267,28 @@ def psf(
     """
     depths_m = depths_from(depths)
     chosen = optic_of(optic, camera, depths_m)
-    way = propagation, sampling
-    prepared = _prepared(chosen, [(line, depth) for depth in depths_m for line in chosen.lines], way, field_rad)
+    traced = is_traced(chosen) or in_jit()
+
+    def light(asked: tuple[float, SpectralLine]) -> Any:
+        """Energy of a line at a depth."""
+        depth_m, line = asked
+        plan = chosen.plan(line, depth_m, propagation, sampling, field_rad)
+        source = chosen.source(line, depth_m, field_rad)
+        if traced:
+            return _compiled(chosen, line, plan, source)
+        # A loop takes as long as what compiles in three times the time.
+        return on_host(_compiled_quickly()(chosen, line, plan.looped if isinstance(plan, FarField) else plan, source))
+
+    asked = [(depth_m, line) for depth_m in depths_m for line in chosen.lines]
+    found = map(light, asked) if traced else at_once(light, asked)
     rows = []
     for _ in depths_m:
         images: list[Any] = [0.0] * len(chosen.colours)
         for line in chosen.lines:
-            plan, source = next(prepared)
-            energy = _compiled
-            if not (is_traced(chosen, source) or in_jit()):
-                energy = _compiled_quickly()
-                if isinstance(plan, FarField) and next(_images(chosen.camera, line.wavelength_m)) < _FEW:
-                    plan = plan.looped
-            image = energy(chosen, line, plan, source)
-            images[line.colour] = images[line.colour] + line.factor * on_host(image)
+            images[line.colour] = images[line.colour] + line.factor * next(found)
             on_psf()
         rows.append(stacked(images))
     return PsfBank(stacked(rows, 1), chosen.colours, depths_m, chosen.pixel_m, field_rad, chosen.camera)
-
-
-def _prepared(
-    optic: Optic,
-    asked: Sequence[tuple[SpectralLine, float]],
-    way: tuple[Propagation | None, float | None],
-    field_rad: tuple[float, float],
-) -> Iterator[tuple[Any, Any]]:
-    """Plan and source of every line and depth, each made while the light of the one before it is computed."""
-
-    def prepare(line: SpectralLine, depth: float) -> tuple[Any, Any]:
-        return optic.plan(line, depth, *way, field_rad), optic.source(line, depth, field_rad)
-
-    if is_traced(optic) or in_jit():  # a trace is one thread's own
-        yield from (prepare(*each) for each in asked)
-        return
-    with ThreadPoolExecutor(1) as ahead:
-        begun = ahead.submit(prepare, *asked[0])
-        for each in asked[1:]:
-            following = ahead.submit(prepare, *each)
-            yield begun.result()
-            begun = following
-        yield begun.result()
-
-
-# Up to so many images of a wavelength take less time than what makes each of them quicker takes to compile.
-_FEW = 8
-
-
-@lru_cache(maxsize=256)
-def _images(camera: Camera, wavelength_m: float) -> Iterator[int]:
-    """Counts the images of a wavelength."""
-    return count()
 
 
 def _energy(optic: Optic, line: SpectralLine, plan: Any, source: Any) -> Array:

@@ -11,6 +11,7 @@ seem to resolve nothing at the sensor's own limit.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,11 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim.camera import Camera
+from sim.camera import Camera, SpectralLine
 from sim.metrics import near_and_far
 from sim.optic import CellOptic
 from sim.propagation.pupil import DoeRows, SourceColumns, block_size, doe_field, in_blocks
 from sim.psf_bank import Length, depths_from, optic_of
+from sim.threads import at_once
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -98,15 +100,20 @@ def mtf(
     lags = np.arange(camera.grid.shape[1])
     shares = camera.shares
     weights = [weight for colour in camera.colours for weight in colour.weights]
-    for d, depth in enumerate(depths_m):
-        for k, weight in enumerate(weights):
-            modes = camera.lines[k * len(shares) : (k + 1) * len(shares)]  # they add up as they pass the opening
-            spectra = [_row_spectra(*doe.rows(line, doe.source(line, depth))) for line in modes]
-            power = np.sum([share * np.asarray(one, np.float64) for share, one in zip(shares, spectra, strict=True)], 0)
-            correlation, line = np.fft.ifft(power)[: len(lags)] / power.mean(), modes[0]
-            lag = line.wavelength_m * camera.sensor_distance_m * frequencies / camera.grid.pitch_m
-            otf[line.colour, d] += weight * np.interp(lag, lags, correlation.real, right=0.0)
-            otf[line.colour, d] += 1j * weight * np.interp(lag, lags, correlation.imag, right=0.0)
+
+    def power(asked: tuple[int, SpectralLine]) -> np.ndarray:
+        """Spectrum of a line at a depth."""
+        d, line = asked
+        return np.asarray(_row_spectra(*doe.rows(line, doe.source(line, depths_m[d]))), np.float64)
+
+    spectra = at_once(power, list(product(range(len(depths_m)), camera.lines)))
+    for d, (k, weight) in product(range(len(depths_m)), enumerate(weights)):
+        line = camera.lines[k * len(shares)]
+        whole = np.sum([share * next(spectra) for share in shares], 0)  # modes add up as they pass the opening
+        correlation = np.fft.ifft(whole)[: len(lags)] / whole.mean()
+        lag = line.wavelength_m * camera.sensor_distance_m * frequencies / camera.grid.pitch_m
+        otf[line.colour, d] += weight * np.interp(lag, lags, correlation.real, right=0.0)
+        otf[line.colour, d] += 1j * weight * np.interp(lag, lags, correlation.imag, right=0.0)
     pixel = np.sinc(camera.pixel_m * camera.fill * frequencies)
     return TransferBank(np.abs(otf * pixel), frequencies, depths_m, camera)
 

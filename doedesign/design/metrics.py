@@ -15,6 +15,7 @@ from doedesign.design.patterns import offset_m, positive_place, spot_centres_m
 from doedesign.spec import Spec
 from sim.camera import Camera
 from sim.metrics import (
+    EnergyBudget,
     airy_radius_m,
     energy_budget,
     mean_wavelength_m,
@@ -26,6 +27,7 @@ from sim.metrics import (
 )
 from sim.optic import CellOptic
 from sim.psf_bank import PsfBank
+from sim.threads import at_once
 
 
 def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank) -> list[dict[str, Any]]:
@@ -36,11 +38,13 @@ def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], l
     """
     pitch = lens.metric_inputs().camera.grid.pitch_m
     rows = without_infinities(metric_rows(bank.metric_inputs(near_m, optic, lens=lens), "design"))
-    places = ((d, c) for d in range(len(bank.depths_m)) for c in range(len(bank.colours)))
-    for row, (d, c) in zip(rows, places, strict=True):
-        colour = optic.camera.colours[c]
-        row["budget"] = energy_budget(optic, bank.energy[c, d], bank.depths_m[d], colour, pitch_m=pitch)._asdict()
-    return rows
+    places = list(product(range(len(bank.depths_m)), range(len(bank.colours))))
+
+    def budget(place: tuple[int, int]) -> EnergyBudget:
+        d, c = place
+        return energy_budget(optic, bank.energy[c, d], bank.depths_m[d], optic.camera.colours[c], pitch_m=pitch)
+
+    return [row | {"budget": one._asdict()} for row, one in zip(rows, at_once(budget, places), strict=True)]
 
 
 def all_of(bank: PsfBank, lens: PsfBank, near: int) -> PsfSet:

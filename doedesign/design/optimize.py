@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,10 +27,10 @@ from jaxtyping import Array, Float, UInt8
 
 from doedesign.design.design import Design
 from doedesign.design.levels.etch_depths import height_histogram, optimal_levels, recipe_depths_m
-from doedesign.design.levels.parametrize import Parameters
+from doedesign.design.levels.parametrize import LevelParametrization, Parameters
 from doedesign.design.levels.printable import PrintableLevels, first_printed, moved_phases
 from doedesign.design.levels.quantisation import Rounding, rounding_at
-from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, value_and_slope, view_of
+from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, value_and_slope
 from doedesign.design.robust import RobustState, RobustTask
 from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
@@ -143,43 +144,60 @@ def first_parameters(spec: Spec, radians: Array) -> Parameters:
     return Parameters(radians, jnp.zeros(spec.process.masks, jnp.float32) if learns_depths else None)
 
 
-def _loss(parameters: Parameters, problem: Problem, look: StepSources, rounding: Rounding) -> tuple[Array, Array]:
-    return losses(problem, view_of(problem, problem.parametrization.height_of(parameters, rounding), look))
+@eqx.filter_jit
+def _height_of(parametrization: LevelParametrization, parameters: Parameters, rounding: Rounding) -> Array:
+    return parametrization.height_of(parameters, rounding)
 
 
 def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
-    """Return the compiled update (`step_inputs`, (parameters, adam)) -> ((parameters, adam), loss, terms).
+    """Return the update (`step_inputs`, (parameters, adam)) -> ((parameters, adam), loss, terms).
 
-    It reuses the memory of the state it is given.
+    It compiles its parts on the first call, and reuses the memory of the state it is given.
     """
     optimiser = optimiser_of(spec)
 
-    def update(inputs: tuple[Problem, StepSources, Rounding], state: tuple[Any, optax.OptState]) -> Any:
+    def moved(inputs: tuple[LevelParametrization, Rounding, Array], state: tuple[Any, optax.OptState]) -> Any:
+        parametrization, rounding, slope = inputs
         parameters, adam = state
-        (loss, terms), gradient = jax.value_and_grad(_loss, has_aux=True)(parameters, *inputs)
+        (gradient,) = jax.vjp(lambda parameters: parametrization.height_of(parameters, rounding), parameters)[1](slope)
         updates, adam = optimiser.update(gradient, adam)
-        return (optax.apply_updates(parameters, updates), adam), loss, terms
+        return optax.apply_updates(parameters, updates), adam
 
-    return compiled_step(update)
+    move = compiled_step(moved)
+
+    def update(inputs: tuple[Problem, StepSources, Rounding], state: tuple[Any, optax.OptState]) -> Any:
+        problem, look, rounding = inputs
+        parametrization = problem.parametrization
+        height = _height_of(parametrization, state[0], rounding)
+        loss, terms, slope = value_and_slope(problem, height, look)
+        return move((parametrization, rounding, slope), state), loss, terms
+
+    return update
 
 
 def make_printed_update(spec: Spec) -> Callable[[Any, Any], Any]:
-    """Return the compiled update of a step that looks at given levels; as `make_update`, with their heights before.
+    """Return the update of a step that looks at given levels; as `make_update`, with their heights before.
 
     Phases are pulled toward the levels. The update takes (problem, sources, heights `[y, x]` in metres) and the state
     (parameters, adam), and returns the new state, the loss, its terms, and the levels nearest to the new phases.
     """
     optimiser = optimiser_of(spec)
 
-    def update(inputs: tuple[Problem, StepSources, Array], state: tuple[Any, optax.OptState]) -> Any:
-        problem, look, height_m = inputs
-        parametrization = problem.parametrization
-        loss, terms, slope = value_and_slope(problem, height_m, look)
+    def moved(inputs: tuple[LevelParametrization, Array, Array], state: tuple[Any, optax.OptState]) -> Any:
+        parametrization, slope, height_m = inputs
         parameters, adam = moved_phases(optimiser, parametrization, state, slope, height_m)
         wanted = parametrization.level(parametrization.continuous_m(parameters.radians)).astype(jnp.uint8)
-        return (parameters, adam), loss, terms, wanted
+        return (parameters, adam), wanted
 
-    return compiled_step(update)
+    move = compiled_step(moved)
+
+    def update(inputs: tuple[Problem, StepSources, Array], state: tuple[Any, optax.OptState]) -> Any:
+        problem, look, height_m = inputs
+        loss, terms, slope = value_and_slope(problem, height_m, look)
+        state, wanted = move((problem.parametrization, slope, height_m), state)
+        return state, loss, terms, wanted
+
+    return update
 
 
 def step_inputs(spec: Spec, problem: Problem, scene: SourceSet, step: int) -> tuple[Problem, StepSources, Rounding]:

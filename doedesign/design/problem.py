@@ -1,7 +1,8 @@
 """The optimisation problem of a spec: from parameters to the loss of one step, ready to differentiate."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,13 +17,14 @@ from doedesign.design.levels.parametrize import LevelParametrization
 from doedesign.design.objectives import Objective, PsfSet, Term, terms_from_spec
 from doedesign.spec import Spec
 from fab.levels import Levels
-from sim.camera import Camera
+from sim.camera import Camera, SpectralLine
 from sim.metrics import participation
-from sim.optic import HeightOptic, RingOptic, colour_energies
+from sim.optic import HeightOptic, RingOptic
 from sim.propagation.farfield import displaced
 from sim.propagation.hankel import ring_count
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
+from sim.threads import at_once
 
 
 class StepSources(NamedTuple):
@@ -171,46 +173,137 @@ def plans_of(spec: Spec) -> Problem:
     )
 
 
-def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
-    """PSFs of a height map (or profile) for the sources of a step, as objectives see them."""
-    optic, camera, lens = problem.optic.with_heights(height_m), problem.camera, look.lens
+Images = tuple[tuple[tuple[Array, ...], ...], tuple[tuple[Array, ...], ...]]
+"""Energies `[y, x]` at near depths and at far ones: `[line][depth]`, of the lines that a step looks at."""
+
+
+class _Asked(NamedTuple):
+    """An image that a step looks at."""
+
+    line: SpectralLine
+    plan: Any
+    source: Any
+
+
+def _asked(problem: Problem, look: StepSources) -> list[list[list[_Asked]]]:
+    """The images of a step: `[near or far][line][depth]`."""
+    seen, plans = [], problem.plans
+    for number, line in enumerate(problem.optic.lines):
+        if look.colour in (None, line.colour):
+            # Only far-field plans are displaced: see `_is_sparse`.
+            plan = plans[number] if look.offset_m is None else displaced(plans[number], look.offset_m)
+            seen.append((number, line, plan))
+    return [[[_Asked(line, plan, one) for one in side[n]] for n, line, plan in seen] for side in (look.near, look.far)]
+
+
+def _energy(optic: Any, height_m: Array, asked: _Asked) -> Float[Array, "y x"]:
+    return asked.line.factor * optic.with_heights(height_m).energy(*asked)
+
+
+def _view(images: Images, camera: Camera, look: StepSources) -> PsfSet:
+    """Images as objectives see them."""
+    lines, lens = [line for line in camera.lines if look.colour in (None, line.colour)], look.lens
     if look.colour is not None:
         camera, lens = replace(camera, colours=(camera.colours[look.colour],)), lens[look.colour : look.colour + 1]
-    # Only far-field plans are displaced: see `_is_sparse`.
-    plans = problem.plans if look.offset_m is None else [displaced(plan, look.offset_m) for plan in problem.plans]
 
-    def bank(sources: tuple[tuple[Any, ...], ...]) -> Array:
-        images = [colour_energies(optic, plans, list(one), look.colour) for one in zip(*sources, strict=True)]
-        return jnp.stack(images, 1) if images else jnp.zeros((len(camera.colours), 0, camera.window, camera.window))
+    def bank(side: tuple[tuple[Array, ...], ...]) -> Float[Array, "w d y x"]:
+        depths = []
+        for energies in zip(*side, strict=True):
+            colours: dict[int, list[Array]] = {line.colour: [] for line in lines}
+            for line, energy in zip(lines, energies, strict=True):
+                colours[line.colour].append(energy)
+            depths.append(jnp.stack([jnp.sum(jnp.stack(parts), axis=0) for parts in colours.values()]))
+        return jnp.stack(depths, 1) if depths else jnp.zeros((len(camera.colours), 0, camera.window, camera.window))
 
-    return PsfSet(bank(look.near), bank(look.far), lens, camera)
+    near, far = images
+    return PsfSet(bank(near), bank(far), lens, camera)
+
+
+def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
+    """PSFs of a height map (or profile) for the sources of a step, as objectives see them; may be traced."""
+    near, far = (
+        tuple(tuple(_energy(problem.optic, height_m, one) for one in depths) for depths in side)
+        for side in _asked(problem, look)
+    )
+    return _view((near, far), problem.camera, look)
 
 
 def losses(problem: Problem, view: PsfSet) -> tuple[Array, Array]:
     """The loss, and the value of every term."""
-    values = jnp.stack([term.value(view) for term in problem.terms])
-    return jnp.dot(jnp.asarray([term.weight for term in problem.terms]), values), values
+    return _losses(problem.terms, view)
 
 
-@eqx.filter_jit
-def _judge(problem: Problem, height_m: Array, look: StepSources) -> Array:
-    return losses(problem, view_of(problem, height_m, look))[0]
+def _losses(terms: tuple[Term, ...], view: PsfSet) -> tuple[Array, Array]:
+    values = jnp.stack([term.value(view) for term in terms])
+    return jnp.dot(jnp.asarray([term.weight for term in terms]), values), values
 
 
 def judge_height(problem: Problem, scene: SourceSet, height_m: Float[np.ndarray, "*s"]) -> float:
     """Loss of given heights at the first near and far depth, without gradient (for searches over few parameters)."""
-    return float(_judge(problem, jnp.asarray(height_m, jnp.float32), scene.first_look()))
+    height, look = jnp.asarray(height_m, jnp.float32), scene.first_look()
+    asked = _asked(problem, look)
+    images = _nested(asked, at_once(lambda one: _lit(problem.optic, height, one).block_until_ready(), _flat(asked)))
+    return float(_judged(problem.terms, problem.camera, images, look)[0])
 
 
-@eqx.filter_jit
 def value_and_slope(
     problem: Problem, drawn_m: Float[Array, "*s"], look: StepSources
 ) -> tuple[Float[Array, ""], Float[Array, " term"], Float[Array, "*s"]]:
-    """Loss of heights (metres) of the pixels that are drawn, its terms, and its derivative with respect to them."""
-    cells = problem.parametrization.cells
+    """Loss of heights (metres) of the pixels that are drawn, its terms, and its derivative with respect to them.
 
-    def loss_of(height_m: Array) -> tuple[Array, Array]:
-        return losses(problem, view_of(problem, cells(height_m), look))
+    Images are computed side by side (`sim.threads`), there and back. It compiles its parts, and is none of a trace.
+    """
+    asked = _asked(problem, look)
 
-    (loss, terms), slope = jax.value_and_grad(loss_of, has_aux=True)(drawn_m)
-    return loss, terms, slope
+    def there(one: _Asked) -> tuple[Array, Any]:
+        return jax.block_until_ready(_there(problem.optic, problem.parametrization, drawn_m, one))
+
+    def back(each: tuple[Any, Array]) -> Array:
+        return jax.block_until_ready(_back(*each))
+
+    energies, ways_back = zip(*at_once(there, _flat(asked)), strict=True)
+    (loss, terms), slopes = _judged_with_slope(problem.terms, problem.camera, _nested(asked, energies), look)
+    ways = list(zip(ways_back, jax.tree.leaves(slopes), strict=True))
+    return loss, terms, reduce(_sum, at_once(back, ways))
+
+
+def _flat(asked: list[list[list[_Asked]]]) -> list[_Asked]:
+    return [one for side in asked for depths in side for one in depths]
+
+
+def _nested(asked: list[list[list[_Asked]]], energies: Iterable[Array]) -> Images:
+    """Images of a list as `_flat` makes it."""
+    images = iter(energies)
+    near, far = (tuple(tuple(next(images) for _ in depths) for depths in side) for side in asked)
+    return near, far
+
+
+@eqx.filter_jit
+def _lit(optic: Any, height_m: Array, asked: _Asked) -> Array:
+    return _energy(optic, height_m, asked)
+
+
+@eqx.filter_jit
+def _there(optic: Any, parametrization: LevelParametrization, drawn_m: Array, asked: _Asked) -> tuple[Array, Any]:
+    """An image, and the function that takes a derivative with respect to it to one with respect to the heights."""
+    return jax.vjp(lambda drawn_m: _energy(optic, parametrization.cells(drawn_m), asked), drawn_m)
+
+
+@eqx.filter_jit
+def _back(way: Any, slope: Array) -> Array:
+    return way(slope)[0]
+
+
+@eqx.filter_jit
+def _judged(terms: tuple[Term, ...], camera: Camera, images: Images, look: StepSources) -> tuple[Array, Array]:
+    return _losses(terms, _view(images, camera, look))
+
+
+@eqx.filter_jit
+def _judged_with_slope(terms: tuple[Term, ...], camera: Camera, images: Images, look: StepSources) -> Any:
+    return jax.value_and_grad(lambda images: _losses(terms, _view(images, camera, look)), has_aux=True)(images)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _sum(one: Array, other: Array) -> Array:
+    return one + other

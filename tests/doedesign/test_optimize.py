@@ -10,7 +10,7 @@ import pytest
 from doedesign import optimization
 from doedesign.design.descent import descend, looks_of
 from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
-from doedesign.design.problem import losses, problem_of, view_of
+from doedesign.design.problem import losses, problem_of, value_and_slope, view_of
 from doedesign.runs.folder import begin_run, claim_run
 from doedesign.spec import Spec, load_spec
 from fab.errors import InputError
@@ -74,6 +74,28 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
     difference = float(loss(radians + step * direction) - loss(radians - step * direction)) / (2 * step)
     # Central differences in float32: rounding 1e-7 / 6e-3 = 2e-5 of the loss, curvature of the same order.
     assert slope == pytest.approx(difference, rel=0.02, abs=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [[], ["optimize.colours=together"], ["optimize.drawn_pixel=3.7 um"]])
+def test_slope_from_images_side_by_side_is_that_of_one_program(more: list[str]) -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, *more])
+    problem, scene = problem_of(spec, {})
+    block = problem.parametrization.block
+    shape = tuple(count // block for count in problem.optic.shape)
+    drawn = jnp.asarray(np.random.default_rng(1).uniform(0, 1.2e-6, shape), jnp.float32)
+    look = scene.look(0, 0)
+    assert (look.colour is None) == bool(more and "together" in more[0])
+
+    def traced(drawn: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return losses(problem, view_of(problem, problem.parametrization.cells(drawn), look))
+
+    (loss, terms), slope = jax.value_and_grad(traced, has_aux=True)(drawn)
+    found = value_and_slope(problem, drawn, look)
+    # The same operations, fused and summed in another order in float32.
+    assert float(found[0]) == pytest.approx(float(loss), rel=1e-5)
+    np.testing.assert_allclose(found[1], terms, rtol=1e-5)
+    assert np.linalg.norm(found[2] - slope) < 1e-4 * np.linalg.norm(slope)
 
 
 @pytest.mark.slow

@@ -112,9 +112,9 @@ class LevelParametrization(eqx.Module):
         return sum((d * rise[level] for d, rise in zip(depths_m, rises, strict=True)), jnp.zeros(()))
 
     def height_of(self, parameters: Parameters, rounding: Rounding) -> Float[Array, "*s"]:
-        """`height_m` of all that an optimisation moves, on the optic's cells."""
+        """`height_m` of all that an optimisation moves, of the pixels that are drawn."""
         ratio = parameters.log_depth_ratio
-        return self.cells(self.height_m(parameters.radians, rounding, None if ratio is None else self.depths_m(ratio)))
+        return self.height_m(parameters.radians, rounding, None if ratio is None else self.depths_m(ratio))
 
     def _at_random(self, height_m: Float[Array, "*s"], rounding: Rounding) -> Float[Array, "*s"]:
         """Heights of levels drawn at random, on even steps, which go round: level L is level 0 of the next wave."""
