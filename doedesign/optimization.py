@@ -15,7 +15,7 @@ from doedesign.design.accuracy import accuracies, in_words
 from doedesign.design.descent import descend
 from doedesign.design.design import Design
 from doedesign.design.levels.etch_depths import height_histogram, light_cost
-from doedesign.design.metrics import design_metrics, drawn_patterns
+from doedesign.design.metrics import DrawnPattern, design_metrics, drawn_patterns
 from doedesign.design.objectives import Objective, Term, source_digests
 from doedesign.design.optimize import (
     OptimizationState,
@@ -44,7 +44,7 @@ from doedesign.runs.level_maps import open_design, read_any_height, write_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, input_files, load_spec, spec_warnings
 from fab.errors import InputError
-from fab.figure import save
+from fab.figure import drawn_beside
 from fab.files import canonical_json, write_atomic
 from fab.height import HeightMap
 from fab.levels import Levels
@@ -62,6 +62,8 @@ from sim.rigorous.edge_optic import optic_as_drawn
 from sim.transfer import mtf
 
 if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
     from doedesign.areas.design import AreaState
     from doedesign.focus.design import FocusState
     from doedesign.spots.design import SpotState
@@ -310,47 +312,52 @@ def write_results(
     levels = None if spec.optimize.quantisation == "none" else design.levels
     names = [*write_design(run.folder, design), "history.jsonl", "metrics.json", "spec.toml"]
     write_history(run, design.history)
-    drawn, flat = optic_as_drawn(camera, height, depths_m=(*near, *far)), HeightOptic.of(camera)
-    bank, lens = (psf(each, depths=(*near, *far), propagation=propagation) for each in (drawn, flat))
-    rows = design_metrics(drawn, bank, near, lens)
-    metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text, "light": camera.light, **(more or {})}
-    if patterns := drawn_patterns(spec, camera, bank, terms):
-        metrics["patterns"] = without_infinities([pattern.summary() for pattern in patterns])
-    if spec.process.chooses_depths:
-        metrics["etches"] = _etch_metrics(camera, design)
-    remark = ""
-    if propagation == "far_field":
-        ends = sorted({min(near + far), max(near + far)})
-        budget = accuracies(drawn, bank, ends)
-        metrics["accuracy"] = without_infinities([one._asdict() for one in budget])
-        remark = in_words(budget, camera)
-        log.info(remark)
-    if (aimed := on_target(design, drawn)) is not None:
-        metrics[aimed.name] = aimed.summary()
-        log.info(aimed.describe())
-        write_atomic(run.path(f"{aimed.name}.csv"), aimed.to_csv().encode())
-        save(aimed.plot(), run.path(f"{aimed.name}.png"))
-        names += [f"{aimed.name}.csv", f"{aimed.name}.png"]
-    write_atomic(run.path("metrics.json"), canonical_json(metrics))
-    save(plot_height(HeightMap(height, camera.grid, spec.doe.relief), levels, spec.name), run.path("height.png"))
-    save(plot_psfs(bank, camera, near, far, title=spec.name, remark=remark), run.path("psf.png"))
-    transfers = [mtf(each, depths=(*near, *far)) for each in (drawn, flat)]
-    save(plot_mtf(transfers[0], camera, near, far, transfers[1], title=spec.name), run.path("mtf.png"))
-    within = encircled_curves([bank, lens])
-    save(plot_encircled(bank, camera, near, far, lens, title=spec.name, curves=within), run.path("encircled.png"))
-    write_atomic(run.path("mtf.csv"), mtf_csv(*transfers).encode())
-    write_atomic(run.path("encircled.csv"), encircled_csv(bank, within, camera).encode())
+    with drawn_beside() as draw:
+        heights = HeightMap(height, camera.grid, spec.doe.relief)
+        draw(run.path("height.png"), plot_height, heights, levels, spec.name)
+        if design.history:
+            drawing, note = plot_history if spec.spots is None else plot_spot_history, history_note(spec)
+            draw(run.path("history.png"), drawing, design.history, title=spec.name, note=note)
+        drawn, flat = optic_as_drawn(camera, height, depths_m=(*near, *far)), HeightOptic.of(camera)
+        bank, lens = (psf(each, depths=(*near, *far), propagation=propagation) for each in (drawn, flat))
+        within = encircled_curves([bank, lens])
+        picture = run.path("encircled.png")
+        draw(picture, plot_encircled, bank, camera, near, far, lens, title=spec.name, curves=within)
+        rows = design_metrics(drawn, bank, near, lens)
+        metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text, "light": camera.light, **(more or {})}
+        if patterns := drawn_patterns(spec, camera, bank, terms):
+            metrics["patterns"] = without_infinities([pattern.summary() for pattern in patterns])
+        if spec.process.chooses_depths:
+            metrics["etches"] = _etch_metrics(camera, design)
+        remark = ""
+        if propagation == "far_field":
+            ends = sorted({min(near + far), max(near + far)})
+            budget = accuracies(drawn, bank, ends)
+            metrics["accuracy"] = without_infinities([one._asdict() for one in budget])
+            remark = in_words(budget, camera)
+            log.info(remark)
+        draw(run.path("psf.png"), plot_psfs, bank, camera, near, far, title=spec.name, remark=remark)
+        transfers = [mtf(each, depths=(*near, *far)) for each in (drawn, flat)]
+        draw(run.path("mtf.png"), plot_mtf, transfers[0], camera, near, far, transfers[1], title=spec.name)
+        if (aimed := on_target(design, drawn)) is not None:
+            metrics[aimed.name] = aimed.summary()
+            log.info(aimed.describe())
+            write_atomic(run.path(f"{aimed.name}.csv"), aimed.to_csv().encode())
+            draw(run.path(f"{aimed.name}.png"), aimed.plot)
+            names += [f"{aimed.name}.csv", f"{aimed.name}.png"]
+        write_atomic(run.path("metrics.json"), canonical_json(metrics))
+        write_atomic(run.path("mtf.csv"), mtf_csv(*transfers).encode())
+        write_atomic(run.path("encircled.csv"), encircled_csv(bank, within, camera).encode())
+        for number, one in enumerate(patterns, 1):
+            names.append("pattern.png" if number == 1 else f"pattern_{number}.png")
+            draw(run.path(names[-1]), _pattern_picture, one, camera)
     names += ["height.png", "psf.png", "mtf.png", "mtf.csv", "encircled.png", "encircled.csv"]
-    if design.history:
-        drawing = plot_history if spec.spots is None else plot_spot_history
-        picture = drawing(design.history, title=spec.name, note=history_note(spec))
-        save(picture, run.path("history.png"))
-        names.append("history.png")
-    for number, one in enumerate(patterns, 1):
-        named = [] if one.colour is None or one.depth_m is None else [one.colour, format_length(one.depth_m)]
-        picture = plot_pattern(
-            one.target, one.light, camera, efficiency=one.efficiency, uniformity=one.uniformity, title=", ".join(named)
-        )
-        names.append("pattern.png" if number == 1 else f"pattern_{number}.png")
-        save(picture, run.path(names[-1]))
-    return names
+    return [*names, "history.png"] if design.history else names
+
+
+def _pattern_picture(one: DrawnPattern, camera: Camera) -> "FigureBase":
+    """The light of a target beside it."""
+    named = [] if one.colour is None or one.depth_m is None else [one.colour, format_length(one.depth_m)]
+    return plot_pattern(
+        one.target, one.light, camera, efficiency=one.efficiency, uniformity=one.uniformity, title=", ".join(named)
+    )

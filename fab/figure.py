@@ -11,12 +11,13 @@ import io
 import math
 import textwrap
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +167,36 @@ def png_bytes(drawn: "Axes | FigureBase") -> bytes:
 def save(drawn: "Axes | FigureBase", path: str | Path) -> None:
     """Write the figure that a picture was drawn on as a PNG file."""
     write_atomic(path, png_bytes(drawn))
+
+
+class Drawing(Protocol):
+    """Has a picture drawn and saved."""
+
+    def __call__(self, path: Path, plot: "Callable[..., Axes | FigureBase]", /, *given: Any, **more: Any) -> None:
+        """Save what a function draws of some arguments."""
+
+
+@contextmanager
+def drawn_beside() -> Iterator[Drawing]:
+    """Draw pictures one after another in a thread, while this one computes.
+
+    Yields:
+        a function that takes a file, a function that draws, and its arguments. All are drawn when the block ends; an
+        error of one is raised there, and an error within the block leaves out those that have not begun.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        begun: list[Future[None]] = []
+
+        def draw(path: Path, plot: "Callable[..., Axes | FigureBase]", /, *given: Any, **more: Any) -> None:
+            begun.append(pool.submit(lambda: save(plot(*given, **more), path)))
+
+        try:
+            yield draw
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+        for one in begun:
+            one.result()
 
 
 def html_of(title: str, rows: Mapping[str, object], drawn: "Axes | FigureBase | None" = None) -> str:

@@ -400,8 +400,6 @@ def direction_sines(field_rad: tuple[float, float]) -> Float[np.ndarray, "2"]:
     return tangents / np.sqrt(1.0 + np.sum(tangents**2))
 
 
-# Colours of one depth share the path; one array is kept, and it is read-only.
-@lru_cache(maxsize=1)
 def source_path_m(
     camera: Camera, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
 ) -> Float[np.ndarray, "y x"]:
@@ -411,15 +409,34 @@ def source_path_m(
     sensor at distance d. The linear path of field angles (y, x), the tilt that moves the image, is removed: the window
     follows the chief ray.
     """
+    return _whole(_distinct_path_m(camera, depth_m, field_rad), camera.grid.shape)
+
+
+def source_waves(
+    camera: Camera, wavelength_m: float, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
+) -> Float[np.ndarray, "y x"]:
+    """`source_path_m` in waves, as `wrapped_waves` has it."""
+    return _whole(wrapped_waves(_distinct_path_m(camera, depth_m, field_rad), wavelength_m), camera.grid.shape)
+
+
+# Colours of one depth share the path, and so do those who look at a PSF in several ways; arrays are read-only.
+@lru_cache(maxsize=4)
+def _distinct_path_m(camera: Camera, depth_m: float, field_rad: tuple[float, float]) -> Float[np.ndarray, "v u"]:
+    """`source_path_m` to cells from which all follow: on the axis those of a quarter, else all."""
     y, x = (camera.grid.axis_m(axis) for axis in ("y", "x"))
-    if any(field_rad):
-        path = path_at_m(camera, y[:, None], x, depth_m, field_rad)
-    else:  # the same in all four quarters, to the last bit
-        across_y, across_x = (np.abs(np.arange(1 - len(axis), len(axis), 2)) // 2 for axis in (y, x))
-        quarter = path_at_m(camera, y[len(y) // 2 :, None], x[len(x) // 2 :], depth_m)
-        path = quarter[across_y[:, None], across_x]
+    if not any(field_rad):
+        y, x = y[len(y) // 2 :], x[len(x) // 2 :]
+    path = path_at_m(camera, y[:, None], x, depth_m, field_rad)
     path.setflags(write=False)
     return path
+
+
+def _whole(distinct: Float[np.ndarray, "v u"], shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:
+    """Values of all cells, of those of a quarter or of all."""
+    if distinct.shape == shape:
+        return distinct
+    across_y, across_x = (np.abs(np.arange(1 - count, count, 2)) // 2 for count in shape)
+    return distinct[across_y[:, None], across_x]
 
 
 def path_at_m(

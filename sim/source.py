@@ -1,6 +1,6 @@
 """Point sources: the optical path from a source to the cells of a DOE, for one wavelength, depth and field angle.
 
-`SourceMap` holds the path to every cell, wrapped in double precision on the host (`sim.camera.source_path_m`).
+`SourceMap` holds the path to every cell, wrapped in double precision on the host (`sim.camera.source_waves`).
 
 `SeparableSource` describes it by a few numbers and two rows of phase, so that one compiled step serves every depth. The
 path from side to side of the aperture is a hundred waves. All but a few of them are a parabola, and a parabola is a sum
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from fab.grid import Grid
-from sim.camera import Camera, direction_sines, source_path_m, wrapped_waves
+from sim.camera import Camera, direction_sines, source_waves, wrapped_waves
 
 Real = Array | np.ndarray | np.float32
 
@@ -50,7 +50,7 @@ class SourceMap(eqx.Module):
         cls, camera: Camera, wavelength_m: float, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
     ) -> "SourceMap":
         """A source at a depth (metres, `inf` allowed) and field angles (y, x), as every cell of the camera sees it."""
-        waves = wrapped_waves(source_path_m(camera, depth_m, field_rad), wavelength_m)
+        waves = source_waves(camera, wavelength_m, depth_m, field_rad)
         return cls(jnp.asarray(waves), jnp.float32(camera.waves_per_metre(wavelength_m, field_rad)))
 
     def over(self, grid: Grid) -> tuple[Array, MapColumns]:

@@ -23,7 +23,7 @@ from doedesign.calibration.geometry import UPRIGHT, GeometryPrior, displacement_
 from doedesign.calibration.target import Image
 from doedesign.calibration.unknowns import Unknowns
 from fab.grid import Grid
-from sim.camera import Camera, source_path_m, wrapped_waves
+from sim.camera import Camera, source_waves
 from sim.propagation.farfield import FarField, bent, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
 from sim.surface import as_fabricated
@@ -128,7 +128,7 @@ class ForwardModel:
             shift = scale * camera.pixel_m / camera.sensor_distance_m
             self._optics[key] = _Optic(
                 plan_far_field(camera, wavelength, depth_m=depth_m, room=room_of(camera, self.geometry)),
-                jnp.asarray(wrapped_waves(source_path_m(camera, depth_m), wavelength)),
+                jnp.asarray(source_waves(camera, wavelength, depth_m)),
                 jnp.asarray(grid.axis_m("x") / grid.pitch_m, jnp.float32),
                 jnp.asarray([shift, shift, scale * grid.pitch_m / 2], jnp.float32),
                 None if self.geometry.upright else camera,

@@ -25,6 +25,7 @@ from sim.optic import HeightOptic
 from sim.propagation.farfield import FarField
 from sim.psf_bank import PsfBank, psf
 from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
+from sim.threads import at_once
 
 _SIDE = 16  # directions per axis, one in each part of the window
 _PARTS = 8  # of a cell on the rim, per axis
@@ -71,10 +72,10 @@ def accuracies(optic: HeightOptic | EdgeOptic, bank: PsfBank, depths_m: Sequence
             for depth, image in zip(depths_m, other, strict=True)
         }
     found = []
-    for depth in depths_m:
+    rims = at_once(lambda depth: rim_error(optic, line, depth), depths_m)
+    for depth, rim in zip(depths_m, rims, strict=True):
         plan = optic.plan(line, depth)
         numerics = plan.expected_error if isinstance(plan, FarField) else None
-        rim = rim_error(optic, line, depth)
         found.append(Accuracy(camera.colours[middle].name, depth, numerics, rim, walls.get(depth), mapped.get(depth)))
     return found
 

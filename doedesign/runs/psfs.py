@@ -21,7 +21,7 @@ from doedesign.runs.verdict import certified_orders, verdict_in_words, with_verd
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed
-from fab.figure import save
+from fab.figure import drawn_beside
 from fab.files import MANIFEST_NAME, canonical_json
 from fab.height import HeightMap
 from fab.plots.height import plot_height
@@ -144,18 +144,22 @@ def _write(
     lens_transfer = mtf(flat, depths=depths)
     metrics: dict[str, Any] = {"lens": camera.lens_text, "light": camera.light}
     within = encircled_curves([*(banks[name] for name in optics), lens])
-    for (name, optic), inside in zip(optics.items(), within[:-1], strict=True):
-        bank, curves = banks[name], [inside, within[-1]]
-        write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name, "lens": camera.lens_text})
-        whose = f"{run.spec.name}, {name.replace('_', ' ')}"
-        save(plot_psfs(bank, camera, near, far, title=whose), folder / f"{name}_psf.png")
-        transfer = mtf(optic, depths=depths)
-        save(plot_mtf(transfer, camera, near, far, lens_transfer, title=whose), folder / f"{name}_mtf.png")
-        picture = plot_encircled(bank, camera, near, far, lens, title=whose, curves=curves)
-        save(picture, folder / f"{name}_encircled.png")
-        (folder / f"{name}_mtf.csv").write_bytes(mtf_csv(transfer, lens_transfer).encode())
-        (folder / f"{name}_encircled.csv").write_bytes(encircled_csv(bank, curves, camera).encode())
-        metrics[name] = design_metrics(optic, bank, near, lens)
+    with drawn_beside() as draw:
+        for (name, optic), inside in zip(optics.items(), within[:-1], strict=True):
+            bank, curves = banks[name], [inside, within[-1]]
+            write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name, "lens": camera.lens_text})
+            whose = f"{run.spec.name}, {name.replace('_', ' ')}"
+            draw(folder / f"{name}_psf.png", plot_psfs, bank, camera, near, far, title=whose)
+            transfer = mtf(optic, depths=depths)
+            draw(folder / f"{name}_mtf.png", plot_mtf, transfer, camera, near, far, lens_transfer, title=whose)
+            picture = folder / f"{name}_encircled.png"
+            draw(picture, plot_encircled, bank, camera, near, far, lens, title=whose, curves=curves)
+            (folder / f"{name}_mtf.csv").write_bytes(mtf_csv(transfer, lens_transfer).encode())
+            (folder / f"{name}_encircled.csv").write_bytes(encircled_csv(bank, curves, camera).encode())
+            metrics[name] = design_metrics(optic, bank, near, lens)
+        if "continuous" in optics:
+            height_map = HeightMap(np.asarray(optics["continuous"].height_m), camera.grid, run.spec.doe.relief)
+            draw(folder / "continuous_height.png", plot_height, height_map, None, f"{run.spec.name}, continuous")
     # Of the map itself; the heights before rounding have other walls.
     metrics["quantised"] = with_verdict(metrics["quantised"], certified)
     if _takes_hankel(run, "continuous", field):
@@ -166,7 +170,4 @@ def _write(
         metrics["from_masks"] = metrics["quantised"]
         for path in sorted(folder.glob("quantised*")):
             shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))
-    if "continuous" in optics:
-        height_map = HeightMap(np.asarray(optics["continuous"].height_m), camera.grid, run.spec.doe.relief)
-        save(plot_height(height_map, None, f"{run.spec.name}, continuous"), folder / "continuous_height.png")
     (folder / "metrics.json").write_bytes(canonical_json(metrics))
