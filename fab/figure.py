@@ -169,7 +169,7 @@ def save(drawn: "Axes | FigureBase", path: str | Path) -> None:
     write_atomic(path, png_bytes(drawn))
 
 
-class Drawing(Protocol):
+class PictureSaver(Protocol):
     """Has a picture drawn and saved."""
 
     def __call__(self, path: Path, plot: "Callable[..., Axes | FigureBase]", /, *given: Any, **more: Any) -> None:
@@ -177,7 +177,7 @@ class Drawing(Protocol):
 
 
 @contextmanager
-def drawn_beside() -> Iterator[Drawing]:
+def drawn_beside() -> Iterator[PictureSaver]:
     """Draw pictures one after another in a thread, while this one computes.
 
     Yields:

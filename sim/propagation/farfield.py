@@ -57,6 +57,9 @@ TOLERANCE = 2e-3  # predicted relative L2 error of pixel energies, unless a plan
 _FIELD_SAMPLING = 1.25
 
 
+_ROWS = 64  # of samples of the intensity: their number is a multiple, and so many stay in a processor's cache
+
+
 class FarField(eqx.Module):
     """Operators of one wavelength and depth."""
 
@@ -146,7 +149,7 @@ def plan_far_field(
     if places is not None:
         reach = largest_reach(places, camera.window) * (1 + 2 * room)
     half = reach + width + 8
-    samples = 64 * int(np.ceil(2 * half / 64))
+    samples = _ROWS * int(np.ceil(2 * half / _ROWS))
     kept = samples if bare else 64 * int(np.ceil((samples * fine / spacing + FIELD_TAPS + 2) / 64))
     positions = (np.arange(samples) - samples // 2) * fine
     # An amplitude per cell of area pitch² gives U = sum t pitch² / (lambda d); a sample stands for fine².
@@ -310,11 +313,20 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
 
     parts = jax.lax.map(refined, blocks)  # [block, part, x, y]
     parts = jnp.transpose(parts, (1, 3, 0, 2)).reshape(2, parts.shape[3], plan.kept)
-    parts = refine.of_complex(parts)
     if pixels is not None:
+        parts = refine.of_complex(parts)
         return pixels.energy(_intensity(plan, parts)), parts
-    columns = gather(parts[0] ** 2 + parts[1] ** 2)
-    return gather(columns.T).T, parts
+
+    # Rows of samples are integrated while they are in the cache.
+    def integrated_rows(rows: Array) -> tuple[Array, Array]:
+        fine = refine.of_complex(rows)
+        return gather(fine[0] ** 2 + fine[1] ** 2), fine
+
+    count = _ROWS if jax.default_backend() == "cpu" else parts.shape[1]
+    rows = jnp.moveaxis(parts.reshape(2, -1, count, plan.kept), 1, 0)
+    columns, fine = jax.lax.map(integrated_rows, rows)
+    columns, parts = columns.reshape(-1, columns.shape[-1]), jnp.moveaxis(fine, 0, 1)
+    return gather(columns.T).T, parts.reshape(2, len(columns), -1)
 
 
 def _intensity(plan: FarField, parts: Array) -> Float[Array, "y x"]:
