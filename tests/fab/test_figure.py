@@ -2,7 +2,10 @@
 
 import base64
 import io
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -12,7 +15,18 @@ from matplotlib.figure import Figure, FigureBase, SubFigure
 from PIL import Image
 
 from fab.errors import InputError
-from fab.figure import evenly_spaced, html_of, length_text, panels, png_bytes, save, scale_bar, shrunk, single
+from fab.figure import (
+    drawn_beside,
+    evenly_spaced,
+    html_of,
+    length_text,
+    panels,
+    png_bytes,
+    save,
+    scale_bar,
+    shrunk,
+    single,
+)
 from tests.pictures import require_whole
 
 
@@ -119,3 +133,47 @@ def test_a_scale_bar_is_the_longest_round_length_within_a_quarter(width_m: float
     wanted = max(length for length in round_ones if length <= width_m / 4 * (1 + 1e-9))
     assert np.asarray(line.get_xdata()) == pytest.approx([0, wanted / width_m])
     assert words.get_text() == length_text(wanted)
+
+
+def square(side: float, title: str = "") -> Any:
+    with single(None, (side, side), title) as axes:
+        axes.plot([0, 1])
+    return axes
+
+
+def test_pictures_drawn_beside_are_those_drawn_here(tmp_path: Path) -> None:
+    with drawn_beside() as draw:
+        for side in (1.0, 1.5):
+            draw(tmp_path / f"{side}.png", square, side, title="a square")
+    for side in (1.0, 1.5):
+        assert (tmp_path / f"{side}.png").read_bytes() == png_bytes(square(side, "a square"))
+
+
+def test_an_error_of_a_picture_is_raised_at_the_end(tmp_path: Path) -> None:
+    def fails() -> Any:
+        raise ValueError("nothing to draw")
+
+    done = []
+    with pytest.raises(ValueError, match="nothing to draw"), drawn_beside() as draw:
+        draw(tmp_path / "none.png", fails)
+        done.append("what follows it here")
+    assert done
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_an_error_beside_leaves_out_pictures_that_have_not_begun(tmp_path: Path) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def waits() -> Any:
+        begun.set()
+        assert go_on.wait(60)
+        return square(1.0)
+
+    threading.Timer(0.5, go_on.set).start()
+    with pytest.raises(KeyboardInterrupt), drawn_beside() as draw:
+        draw(tmp_path / "first.png", waits)
+        draw(tmp_path / "second.png", square, 1.0)
+        assert begun.wait(60)
+        raise KeyboardInterrupt
+    assert (tmp_path / "first.png").exists()
+    assert not (tmp_path / "second.png").exists()
