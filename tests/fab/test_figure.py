@@ -154,9 +154,14 @@ def test_an_error_of_a_picture_is_raised_at_the_end(tmp_path: Path) -> None:
         raise ValueError("nothing to draw")
 
     done = []
-    with pytest.raises(ValueError, match="nothing to draw"), drawn_beside() as draw:
-        draw(tmp_path / "none.png", fails)
-        done.append("what follows it here")
+
+    def draw_and_go_on() -> None:
+        with drawn_beside() as draw:
+            draw(tmp_path / "none.png", fails)
+            done.append("what follows it here")
+
+    with pytest.raises(ValueError, match="nothing to draw"):
+        draw_and_go_on()
     assert done
     assert not (tmp_path / "none.png").exists()
 
@@ -169,11 +174,15 @@ def test_an_error_beside_leaves_out_pictures_that_have_not_begun(tmp_path: Path)
         assert go_on.wait(60)
         return square(1.0)
 
+    def draw_until_stopped() -> None:
+        with drawn_beside() as draw:
+            draw(tmp_path / "first.png", waits)
+            draw(tmp_path / "second.png", square, 1.0)
+            assert begun.wait(60)
+            raise KeyboardInterrupt
+
     threading.Timer(0.5, go_on.set).start()
-    with pytest.raises(KeyboardInterrupt), drawn_beside() as draw:
-        draw(tmp_path / "first.png", waits)
-        draw(tmp_path / "second.png", square, 1.0)
-        assert begun.wait(60)
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        draw_until_stopped()
     assert (tmp_path / "first.png").exists()
     assert not (tmp_path / "second.png").exists()
