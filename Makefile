@@ -55,13 +55,15 @@ clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find doedesign fab sim tests bench examples docs -name __pycache__ -prune -exec rm -rf {} +
 
-# uv installs in a fifth of the time that pip takes; where it cannot, for want of an index that only pip was told of,
-# pip does. Modules are compiled on first use, by either: compiling all of them takes a quarter of the time.
+# uv installs in a fifth of the time that pip takes; where it cannot be had, or cannot install, pip does. It takes the
+# packages from where pip would: an index in place of the public one is handed on to it. Modules are compiled on first
+# use, by either: compiling all of them takes a quarter of the time.
 # The stamp files say which set is installed; they are renewed when the project's needs or pins change.
 define install
 @echo "Installing $(2) into $(VENV) (a minute at most) ..."
 @{ $(PIP) install --constraint $(PINS) uv && \
-    $(BIN)/uv pip install --quiet --python $(BIN)/python --constraint $(PINS) --editable '$(1)'; } 2>/dev/null || \
+    index=$${PIP_INDEX_URL:-$$($(PIP) config get global.index-url || true)} && \
+    $(BIN)/uv pip install --quiet $${index:+--default-index "$$index"} --python $(BIN)/python --constraint $(PINS) --editable '$(1)'; } 2>/dev/null || \
     $(PIP) install --no-compile --constraint $(PINS) --editable '$(1)'
 @touch $@ $(VENV)/.base
 endef

@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from doedesign.design.optimize import finished_design, initial_state, make_update, step_inputs
+from doedesign.design.optimize import finished_design, initial_state, make_update, optimiser_of, step_inputs
 from doedesign.design.problem import problem_of
 from doedesign.design.robust import ROUND, RobustTask
 from doedesign.spec import load_spec
@@ -33,7 +33,7 @@ def main() -> None:
     spec = load_spec(EXAMPLES / ("quick.toml" if quick else "automotive.toml"), sets)
     problem, scene = problem_of(spec, {})
     first = initial_state(spec, problem, scene, {}, lambda path: np.load(path, allow_pickle=False))
-    update, state, plain_s = make_update(spec), (first.parameters, first.adam), []
+    update, state, plain_s = make_update(optimiser_of(spec)), (first.parameters, first.adam), []
     for step in range(PLAIN_STEPS + 2):
         start = time.perf_counter()
         state, loss, _ = update(step_inputs(spec, problem, scene, step), state)

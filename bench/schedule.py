@@ -14,9 +14,8 @@ import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 import optax
@@ -27,11 +26,11 @@ from doedesign.design.optimize import (
     OptimizationState,
     finished_design,
     initial_state,
+    make_update,
     optimiser_of,
     step_inputs,
 )
-from doedesign.design.problem import losses, problem_of, value_and_slope
-from doedesign.runtime.compiling import compiled_step
+from doedesign.design.problem import losses, problem_of
 from doedesign.spec import Spec, load_spec
 from sim.optic import HeightOptic
 from sim.psf_bank import PsfBank, psf
@@ -90,26 +89,11 @@ def seconds(course: Course) -> Iterator[float | Outcome]:
     problem, scene = problem_of(spec, {})
     first = initial_state(spec, problem, scene, {}, lambda path: np.load(path, allow_pickle=False)).parameters
 
-    def moved(inputs: Any, state: Any) -> Any:
-        parametrization, rounding, slope = inputs
-        parameters, adam = state
-        back = jax.vjp(lambda parameters: parametrization.height_of(parameters, rounding), parameters)[1]
-        moves, adam = optimiser.update(back(slope)[0], adam)
-        return optax.apply_updates(parameters, moves), adam
-
-    move = compiled_step(moved)
-    height_of = eqx.filter_jit(problem.parametrization.height_of)
-
-    def step_once(inputs: Any, state: Any) -> Any:
-        problem, look, rounding = inputs
-        found, _, slope = value_and_slope(problem, height_of(state[0], rounding), look)
-        return move((problem.parametrization, rounding, slope), state), found
-
-    state, taken = (first, optimiser.init(first)), []
+    update, state, taken = make_update(optimiser), (first, optimiser.init(first)), []
     for step in range(spec.optimize.steps):
         start = time.perf_counter()
-        state, found = step_once(step_inputs(spec, problem, scene, step), state)
-        jax.block_until_ready((state, found))
+        state, loss, _ = update(step_inputs(spec, problem, scene, step), state)
+        jax.block_until_ready((state, loss))
         taken.append(time.perf_counter() - start)
         yield (step + 1) / spec.optimize.steps
     steps_s = float(np.median(taken)) * len(taken)
@@ -135,7 +119,7 @@ def loss_of(design: Design, lens: PsfBank) -> float:
     """Loss of a design at all depths, by PSFs that integrate every pixel; `lens` are those of the plain lens."""
     assert design.spec is not None
     bank = psf(HeightOptic.of(design.camera, design.height_m), depths=design.depths_m)
-    return float(losses(problem_of(design.spec, {})[0], all_of(bank, lens, len(design.near_m)))[0])
+    return float(losses(problem_of(design.spec, {})[0].terms, all_of(bank, lens, len(design.near_m)))[0])
 
 
 def report(path: Path, sets: tuple[str, ...], few: int, of_then: bool) -> None:

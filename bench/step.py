@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.design.optimize import initial_state, make_update, step_inputs
+from doedesign.design.optimize import initial_state, make_update, optimiser_of, step_inputs
 from doedesign.design.problem import problem_of
 from doedesign.spec import load_spec
 
@@ -24,7 +24,7 @@ def main(rounds: int = 9) -> None:
     spec = load_spec(SPEC, ["optimize.colours=together"])
     problem, scene = problem_of(spec, {})
     first = initial_state(spec, problem, scene, {}, lambda path: np.load(path, allow_pickle=False))
-    update = make_update(spec)
+    update = make_update(optimiser_of(spec))
     state = (first.parameters, first.adam)
     transform = jax.jit(jnp.fft.fft2)
     field = jnp.ones(problem.camera.grid.shape, jnp.complex64)

@@ -195,8 +195,7 @@ def _band_energy(field: Complex[np.ndarray, "y x"], slope: float, band: float = 
     The band reaches to `band` waves per cell on either side of the axis; at most to that of the cells' grid, 1/2.
     The factor sinc(nu - slope x) of a cell is interpolated between three directions, exact to 1e-3 up to a sixth of the
     band, along each axis for itself: three transforms of all rows and three of all columns take the place of one sum
-    per cell. Of directions that differ by less than a hundredth of a wave per cell over the aperture, one
-    does, to 1e-4.
+    per cell. Of directions that differ by less than a hundredth of a wave per cell over the aperture one does, to 1e-4.
     """
     reach = slope * max(field.shape) / 2
     nodes = reach * np.cos(np.pi * np.array([1, 3, 5]) / 6) if abs(reach) > _ALIKE else np.zeros(1)
@@ -209,8 +208,8 @@ def _band_energy(field: Complex[np.ndarray, "y x"], slope: float, band: float = 
         summed = np.zeros(field.shape, np.complex64)
         for a in nodes:
             share = np.prod([(lit - b) / (a - b) for b in nodes if b != a], axis=0) * np.ones(cells)
-            lit_so = field * share.astype(np.float32).reshape(along)
-            part = np.asarray(fft(lit_so, axis=axis, workers=-1, overwrite_x=True))
+            weighted = field * share.astype(np.float32).reshape(along)
+            part = np.asarray(fft(weighted, axis=axis, workers=-1, overwrite_x=True))
             part *= np.sinc(nu - a).astype(np.float32).reshape(along)
             summed += part
         field = summed if inside.all() else summed.compress(inside, axis)

@@ -359,12 +359,9 @@ class RingOptic(CameraOptic):
         return None if profile is None else profile[: ring_count(self.camera)]
 
 
-def colour_energies(
-    optic: Optic, plans: Sequence[Any], sources: Sequence[Any], colour: int | None = None
-) -> Float[Array, "c y x"]:
-    """PSF of every colour, or of one, from the plans and sources of `optic.lines`; for use in a compiled function."""
-    images: dict[int, list[Array]] = {number: [] for number in range(len(optic.colours)) if colour in (None, number)}
+def colour_energies(optic: Optic, plans: Sequence[Any], sources: Sequence[Any]) -> Float[Array, "c y x"]:
+    """PSF of every colour from the plans and sources of `optic.lines`; for use in a compiled function."""
+    images: list[list[Array]] = [[] for _ in optic.colours]
     for line, plan, source in zip(optic.lines, plans, sources, strict=True):
-        if line.colour in images:
-            images[line.colour].append(line.factor * optic.energy(line, plan, source))
-    return jnp.stack([jnp.sum(jnp.stack(parts), axis=0) for parts in images.values()])
+        images[line.colour].append(line.factor * optic.energy(line, plan, source))
+    return jnp.stack([jnp.sum(jnp.stack(parts), axis=0) for parts in images])

@@ -9,12 +9,15 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import jax
-
 _MOST = 8  # each holds a field of its own
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def side_by_side() -> int:
@@ -23,19 +26,19 @@ def side_by_side() -> int:
     Where the environment variable NPROC tells XLA how many threads to take, it is told here too. On another device two,
     of which one is prepared by the host while the other is computed.
     """
+    import jax  # how many cores there are is asked by commands that need none of it
+
     if jax.default_backend() != "cpu":
         return 2
     told = os.environ.get("NPROC", "")
-    if told.isdecimal() and int(told) > 0:
-        return min(int(told), _MOST)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, _MOST)
+    count = int(told) if told.isdecimal() and int(told) > 0 else cores()
+    return min(count, _MOST)
 
 
 def at_once(work: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
-    """`work` of every item, in their order, several at once; none may trace.
+    """`work` of every item, in their order, several at once; none may be part of a trace.
 
-    An error of one ends the others before they begin.
+    After an error no further item is begun.
     """
     count = min(side_by_side(), len(items))
     if count < 2:

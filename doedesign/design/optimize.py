@@ -149,12 +149,11 @@ def _height_of(parametrization: LevelParametrization, parameters: Parameters, ro
     return parametrization.height_of(parameters, rounding)
 
 
-def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
-    """Return the update (`step_inputs`, (parameters, adam)) -> ((parameters, adam), loss, terms).
+def make_update(optimiser: optax.GradientTransformation) -> Callable[[Any, Any], Any]:
+    """Return the update (`step_inputs`, (parameters, adam)) -> ((parameters, adam), loss, terms) of an optimiser.
 
     It compiles its parts on the first call, and reuses the memory of the state it is given.
     """
-    optimiser = optimiser_of(spec)
 
     def moved(inputs: tuple[LevelParametrization, Rounding, Array], state: tuple[Any, optax.OptState]) -> Any:
         parametrization, rounding, slope = inputs
@@ -175,13 +174,12 @@ def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
     return update
 
 
-def make_printed_update(spec: Spec) -> Callable[[Any, Any], Any]:
+def make_printed_update(optimiser: optax.GradientTransformation) -> Callable[[Any, Any], Any]:
     """Return the update of a step that looks at given levels; as `make_update`, with their heights before.
 
     Phases are pulled toward the levels. The update takes (problem, sources, heights `[y, x]` in metres) and the state
     (parameters, adam), and returns the new state, the loss, its terms, and the levels nearest to the new phases.
     """
-    optimiser = optimiser_of(spec)
 
     def moved(inputs: tuple[LevelParametrization, Array, Array], state: tuple[Any, optax.OptState]) -> Any:
         parametrization, slope, height_m = inputs
@@ -219,8 +217,9 @@ def steps(
     Raises:
         InputError: the loss is no longer finite.
     """
-    update, names = make_update(spec), [term.name for term in problem.terms]
-    rules, printed_update = printable_levels(spec, problem), make_printed_update(spec)
+    optimiser, names = optimiser_of(spec), [term.name for term in problem.terms]
+    update, printed_update = make_update(optimiser), make_printed_update(optimiser)
+    rules = printable_levels(spec, problem)
     for step in range(state.step, spec.optimize.steps):
         inputs = step_inputs(spec, problem, scene, step)
         before = state.parameters, state.adam

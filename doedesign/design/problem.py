@@ -1,8 +1,8 @@
 """The optimisation problem of a spec: from parameters to the loss of one step, ready to differentiate."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial, reduce
+from functools import cache, partial, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.levels.parametrize import LevelParametrization
 from doedesign.design.objectives import Objective, PsfSet, Term, terms_from_spec
+from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec
 from fab.levels import Levels
 from sim.camera import Camera, SpectralLine
@@ -196,8 +197,8 @@ def _asked(problem: Problem, look: StepSources) -> list[list[list[_Asked]]]:
     return [[[_Asked(line, plan, one) for one in side[n]] for n, line, plan in seen] for side in (look.near, look.far)]
 
 
-def _energy(optic: Any, height_m: Array, asked: _Asked) -> Float[Array, "y x"]:
-    return asked.line.factor * optic.with_heights(height_m).energy(*asked)
+def _energy(optic: Any, asked: _Asked) -> Float[Array, "y x"]:
+    return asked.line.factor * optic.energy(*asked)
 
 
 def _view(images: Images, camera: Camera, look: StepSources) -> PsfSet:
@@ -221,29 +222,27 @@ def _view(images: Images, camera: Camera, look: StepSources) -> PsfSet:
 
 def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
     """PSFs of a height map (or profile) for the sources of a step, as objectives see them; may be traced."""
+    optic = problem.optic.with_heights(height_m)
     near, far = (
-        tuple(tuple(_energy(problem.optic, height_m, one) for one in depths) for depths in side)
-        for side in _asked(problem, look)
+        tuple(tuple(_energy(optic, one) for one in depths) for depths in side) for side in _asked(problem, look)
     )
     return _view((near, far), problem.camera, look)
 
 
-def losses(problem: Problem, view: PsfSet) -> tuple[Array, Array]:
+def losses(terms: tuple[Term, ...], view: PsfSet) -> tuple[Array, Array]:
     """The loss, and the value of every term."""
-    return _losses(problem.terms, view)
-
-
-def _losses(terms: tuple[Term, ...], view: PsfSet) -> tuple[Array, Array]:
     values = jnp.stack([term.value(view) for term in terms])
     return jnp.dot(jnp.asarray([term.weight for term in terms]), values), values
 
 
+@eqx.filter_jit
+def _judge(problem: Problem, height_m: Array, look: StepSources) -> Array:
+    return losses(problem.terms, view_of(problem, height_m, look))[0]
+
+
 def judge_height(problem: Problem, scene: SourceSet, height_m: Float[np.ndarray, "*s"]) -> float:
     """Loss of given heights at the first near and far depth, without gradient (for searches over few parameters)."""
-    height, look = jnp.asarray(height_m, jnp.float32), scene.first_look()
-    asked = _asked(problem, look)
-    images = _nested(asked, at_once(lambda one: _lit(problem.optic, height, one).block_until_ready(), _flat(asked)))
-    return float(_judged(problem.terms, problem.camera, images, look)[0])
+    return float(_judge(problem, jnp.asarray(height_m, jnp.float32), scene.first_look()))
 
 
 def value_and_slope(
@@ -251,8 +250,11 @@ def value_and_slope(
 ) -> tuple[Float[Array, ""], Float[Array, " term"], Float[Array, "*s"]]:
     """Loss of heights (metres) of the pixels that are drawn, its terms, and its derivative with respect to them.
 
-    Images are computed side by side (`sim.threads`), there and back. It compiles its parts, and is none of a trace.
+    Images are computed side by side (`sim.threads`), there and back; those with light of walls by one program, for they
+    share it. It compiles its parts itself, and cannot be part of a trace.
     """
+    if isinstance(problem.optic, EdgeOptic):
+        return _by_one_program()((problem, drawn_m, look), ())
     asked = _asked(problem, look)
 
     def there(one: _Asked) -> tuple[Array, Any]:
@@ -262,9 +264,25 @@ def value_and_slope(
         return jax.block_until_ready(_back(*each))
 
     energies, ways_back = zip(*at_once(there, _flat(asked)), strict=True)
-    (loss, terms), slopes = _judged_with_slope(problem.terms, problem.camera, _nested(asked, energies), look)
+    (loss, terms), slopes = _judged(problem.terms, problem.camera, _nested(asked, energies), look)
     ways = list(zip(ways_back, jax.tree.leaves(slopes), strict=True))
     return loss, terms, reduce(_sum, at_once(back, ways))
+
+
+@cache
+def _by_one_program() -> Callable[[Any, tuple[()]], Any]:
+    """`value_and_slope` of all images together."""
+
+    def judged(given: tuple[Problem, Array, StepSources], _: tuple[()]) -> Any:
+        problem, drawn_m, look = given
+
+        def loss_of(drawn_m: Array) -> tuple[Array, Array]:
+            return losses(problem.terms, view_of(problem, problem.parametrization.cells(drawn_m), look))
+
+        (loss, terms), slope = jax.value_and_grad(loss_of, has_aux=True)(drawn_m)
+        return loss, terms, slope
+
+    return compiled_step(judged)
 
 
 def _flat(asked: list[list[list[_Asked]]]) -> list[_Asked]:
@@ -279,14 +297,9 @@ def _nested(asked: list[list[list[_Asked]]], energies: Iterable[Array]) -> Image
 
 
 @eqx.filter_jit
-def _lit(optic: Any, height_m: Array, asked: _Asked) -> Array:
-    return _energy(optic, height_m, asked)
-
-
-@eqx.filter_jit
 def _there(optic: Any, parametrization: LevelParametrization, drawn_m: Array, asked: _Asked) -> tuple[Array, Any]:
     """An image, and the function that takes a derivative with respect to it to one with respect to the heights."""
-    return jax.vjp(lambda drawn_m: _energy(optic, parametrization.cells(drawn_m), asked), drawn_m)
+    return jax.vjp(lambda drawn_m: _energy(optic.with_heights(parametrization.cells(drawn_m)), asked), drawn_m)
 
 
 @eqx.filter_jit
@@ -295,13 +308,8 @@ def _back(way: Any, slope: Array) -> Array:
 
 
 @eqx.filter_jit
-def _judged(terms: tuple[Term, ...], camera: Camera, images: Images, look: StepSources) -> tuple[Array, Array]:
-    return _losses(terms, _view(images, camera, look))
-
-
-@eqx.filter_jit
-def _judged_with_slope(terms: tuple[Term, ...], camera: Camera, images: Images, look: StepSources) -> Any:
-    return jax.value_and_grad(lambda images: _losses(terms, _view(images, camera, look)), has_aux=True)(images)
+def _judged(terms: tuple[Term, ...], camera: Camera, images: Images, look: StepSources) -> Any:
+    return jax.value_and_grad(lambda images: losses(terms, _view(images, camera, look)), has_aux=True)(images)
 
 
 @partial(jax.jit, donate_argnums=0)

@@ -24,6 +24,7 @@ from doedesign.runs.folder import COST_NAME, FORMAT
 from doedesign.runtime.progress import duration_text
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, read_json
+from sim.threads import cores
 
 _KIB = 1 if sys.platform == "darwin" else 1024  # what getrusage counts memory in
 _MIB, _GIB = 1 << 20, 1 << 30
@@ -123,7 +124,7 @@ def measured(run: Path | None, command: str, *, writes: Path | None = None) -> I
             usage[0],
             usage[1],
             platform.node(),
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+            cores(),
             datetime.now(UTC).isoformat(timespec="seconds"),
             ended == "done",
         )

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from doedesign import __version__
 from doedesign.runtime.pool import free_gib
 from doedesign.runtime.viewers import browser, has_display, layout_viewer, system_viewer
+from sim.threads import cores
 
 _GIB = 1 << 30
 _LIBRARIES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "matplotlib", "klayout", "gdstk", "cadquery", "pydantic")
@@ -101,7 +102,7 @@ def examine() -> Checkup:
     return Checkup(
         {**versions, **{name: _version(name) for name in _LIBRARIES}},
         _devices(),
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        cores(),
         memory,
         None if free == float("inf") else round(free, 1),
         round(shutil.disk_usage(Path.cwd()).free / _GIB, 1),

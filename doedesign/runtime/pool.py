@@ -21,6 +21,7 @@ from functools import cache, partial
 from typing import Any, ClassVar, Protocol
 
 from fab.errors import InputError
+from sim.threads import cores
 
 _STRIKES = 3
 _GIB = 2**30
@@ -59,8 +60,7 @@ def single_thread_settings() -> dict[str, str]:
 
 def default_workers(peak_bytes: int) -> int:
     """As many workers as there are cores and memory for, given the bytes that one item takes at its peak."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, int(free_gib() / (_BASE_GIB + peak_bytes / _GIB))))
+    return max(1, min(cores(), int(free_gib() / (_BASE_GIB + peak_bytes / _GIB))))
 
 
 def free_gib() -> float:

@@ -197,7 +197,7 @@ def test_gradient_of_the_whole_chain_by_the_depths() -> None:
     @jax.jit
     def loss(log_depth_ratio: jax.Array) -> jax.Array:
         height = staircase.height_m(radians, ROUNDED, staircase.depths_m(log_depth_ratio))
-        return losses(problem, view_of(problem, height, look))[0]
+        return losses(problem.terms, view_of(problem, height, look))[0]
 
     slopes = np.asarray(jax.jit(jax.grad(loss))(jnp.zeros(2)))
     step = 0.25  # half a percent of a depth, 1.5 to 3 nm
@@ -266,5 +266,5 @@ def test_chosen_depths_serve_the_objective_better_than_even_steps() -> None:
         spec = load_spec(QUICK, [*SMALL, *few, *change])
         problem, scene = problem_of(spec, {})
         drawn = finished_design(spec, problem, run(spec)).height_m
-        found[name] = float(losses(problem, view_of(problem, jnp.asarray(drawn), scene.first_look()))[0])
+        found[name] = float(losses(problem.terms, view_of(problem, jnp.asarray(drawn), scene.first_look()))[0])
     assert found["chosen"] < 0.98 * found["even"]

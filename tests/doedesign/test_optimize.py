@@ -65,7 +65,7 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
 
     def loss(radians: jax.Array) -> jax.Array:
         height = radians * problem.parametrization.metres_per_radian  # no wrap: it has no derivative
-        return losses(problem, view_of(problem, height, look))[0]
+        return losses(problem.terms, view_of(problem, height, look))[0]
 
     radians = state.parameters.radians
     direction = jnp.asarray(np.random.default_rng(0).normal(size=radians.shape), jnp.float32)
@@ -77,7 +77,9 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("more", [[], ["optimize.colours=together"], ["optimize.drawn_pixel=3.7 um"]])
+@pytest.mark.parametrize(
+    "more", [[], ["optimize.colours=together"], ["optimize.drawn_pixel=3.7 um"], ["optics.light=edges"]]
+)
 def test_slope_from_images_side_by_side_is_that_of_one_program(more: list[str]) -> None:
     spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, *more])
     problem, scene = problem_of(spec, {})
@@ -88,7 +90,7 @@ def test_slope_from_images_side_by_side_is_that_of_one_program(more: list[str]) 
     assert (look.colour is None) == bool(more and "together" in more[0])
 
     def traced(drawn: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return losses(problem, view_of(problem, problem.parametrization.cells(drawn), look))
+        return losses(problem.terms, view_of(problem, problem.parametrization.cells(drawn), look))
 
     (loss, terms), slope = jax.value_and_grad(traced, has_aux=True)(drawn)
     found = value_and_slope(problem, drawn, look)
@@ -105,8 +107,8 @@ def test_the_loss_is_the_mean_of_what_steps_see_in_turn() -> None:
     assert [scene.look(0, step).colour for step in range(5)] == [0, 1, 2, 0, 1]
     heights = jnp.asarray(np.random.default_rng(1).uniform(0, 1.2e-6, problem.optic.shape), jnp.float32)
     look = scene.look(0, 0)
-    whole = losses(problem, view_of(problem, heights, look._replace(colour=None)))
-    parts = [losses(problem, view_of(problem, heights, look._replace(colour=colour))) for colour in range(3)]
+    whole = losses(problem.terms, view_of(problem, heights, look._replace(colour=None)))
+    parts = [losses(problem.terms, view_of(problem, heights, look._replace(colour=colour))) for colour in range(3)]
     # Sums of about 1e4 pixels in float32, in another order.
     assert float(whole[0]) == pytest.approx(np.mean([float(loss) for loss, _ in parts]), rel=1e-5)
     np.testing.assert_allclose(whole[1], np.mean([terms for _, terms in parts], axis=0), rtol=1e-5)
