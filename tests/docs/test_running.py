@@ -33,9 +33,15 @@ SESSIONS = (
     ("docs/tasks/hdr.md", "docs/tasks/wide-aperture.md"),
     ("docs/tasks/tables.md",),
 )
-# Those with plates of many million cells and networks behind them, with every network of a table, or with one design
-# after the other, of templates that have tests of their own.
-LENGTHY = ("docs/tasks/hdr.md", "docs/tasks/tables.md", "docs/tasks/foci.md")
+# Those with plates of many million cells and networks behind them, with every network of a table, with one design after
+# the other, of templates that have tests of their own, or with dozens of commands, each of which has tests of its own.
+LENGTHY = (
+    "docs/tasks/hdr.md",
+    "docs/tasks/tables.md",
+    "docs/tasks/foci.md",
+    "docs/tutorial.md",
+    "docs/commands/design.md",
+)
 # Compiling a large network takes longer than a few steps of a small one.
 CHANGES = ("train.steps=2", "train.validation=1", "network.depth=1", "network.width=3")
 SMALL = [word for change in CHANGES for word in ("--set", change)]

@@ -81,6 +81,7 @@ def test_a_cubic_phase_hardly_changes_out_of_focus():
     assert alike[1] < 0.9
 
 
+@pytest.mark.slow
 def test_a_quartic_keeps_its_peak_over_as_many_waves_as_it_has():
     """Light on the axis over that of a lens in focus, for W waves of defocus: |∫ exp 2πi (w (t² - t) + W t) dt|².
 

@@ -216,6 +216,7 @@ def test_pictures_of_scenes_ask_for_a_sensor(tmp_path: Path):
         sensor_side(spec_of(tmp_path, GRID))
 
 
+@pytest.mark.slow
 def test_a_pattern_for_objectives_is_told_in_degrees(tmp_path: Path):
     pattern = (
         'objective=[{ name = "target_pattern", options = { pattern = "spots", count = [3, 1], spacing = "2 deg" } }]'

@@ -210,6 +210,7 @@ def test_a_ring_has_the_vortex_of_a_picture(tmp_path: Path):
         optimize(spec)
 
 
+@pytest.mark.slow
 def test_the_problem_sees_the_light_of_the_optic(tmp_path: Path):
     spec = spec_of(tmp_path, "optimize.steps=4")
     task, design = AreaTask.from_spec(spec), optimize(spec)
@@ -233,6 +234,7 @@ def test_the_gradient_is_that_of_the_loss(tmp_path: Path):
     assert slope == pytest.approx((ends[0] - ends[1]) / 0.04, rel=0.02)  # single precision
 
 
+@pytest.mark.slow
 def test_a_rectangle_has_its_size_and_is_even(tmp_path: Path):
     table = areas_of_design(design := optimize(spec_of(tmp_path)), design.as_optic())[0]
     assert table.efficiency > 0.8

@@ -75,6 +75,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
+@pytest.mark.slow
 @glibc
 def test_freed_memory_is_used_again_without_asking_the_system() -> None:
     found = [

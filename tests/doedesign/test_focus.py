@@ -100,6 +100,7 @@ def _radius(design: doedesign.Design) -> np.ndarray:
     return np.hypot(grid.axis_m("y")[:, None], grid.axis_m("x"))
 
 
+@pytest.mark.slow
 def test_the_image_on_the_sensor_agrees(spec_file: Path):
     """The angular spectrum, which shares nothing with the sum along the axis, finds as much light in the focus."""
     design, table = designed(spec_file)
@@ -145,6 +146,7 @@ def test_every_colour_has_its_own_focus(spec_file: Path):
     assert table.worst < 1.05
 
 
+@pytest.mark.slow
 def test_one_distance_for_all_colours(spec_file: Path):
     design, table = designed(spec_file, *COLOURS, "optimize.steps=200")
     assert len(table.strength) == 3
@@ -223,6 +225,7 @@ def test_a_run_holds_table_and_picture(spec_file: Path, tmp_path: Path):
     assert open_design(tmp_path / "run", False).spec is not None
 
 
+@pytest.mark.slow
 def test_a_plate_with_errors_is_followed(spec_file: Path):
     """Etches 5 % too deep take light from the foci and leave it in the 0th order."""
     design, _ = designed(spec_file, *BIFOCAL)

@@ -72,6 +72,7 @@ def test_a_run_says_its_light_and_its_psfs_have_it(run: Path):
     assert off(other["y"], found) > VISIBLE / 10
 
 
+@pytest.mark.slow
 def test_the_loss_is_of_the_light_that_was_asked_for(tmp_path: Path):
     losses = []
     for text in (SPEC, LIT):

@@ -106,6 +106,7 @@ def test_a_design_is_optimised_for_a_sensor_near_by(tmp_path: Path, monkeypatch:
     assert losses[-1] < 0.7 * losses[0]
 
 
+@pytest.mark.slow
 def test_orders_of_a_unit_cell_need_no_lens(tmp_path: Path):
     plain = ("optimize.start='flat'", "optimize.start_options={}", "optimize.steps=20")
     spots = 'spots={ count = [3, 3], period = "80 um", starts = 8 }'

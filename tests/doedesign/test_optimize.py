@@ -136,6 +136,7 @@ def test_resumed_run_has_the_same_bits() -> None:
     assert np.array_equal(whole.parameters.radians, resumed.parameters.radians)
 
 
+@pytest.mark.slow
 def test_design_is_on_levels_and_radial_designs_are_radial() -> None:
     spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.parametrization=radial", "optimize.steps=2"])
     problem, scene = problem_of(spec, {})

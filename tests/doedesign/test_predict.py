@@ -106,6 +106,7 @@ def test_a_deeper_etch_shows_in_every_number_it_should(design: Design, nominal: 
         assert row["throughput"] + row["outside_window"] == pytest.approx(passed, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_chrome_out_of_place_is_booked_as_such(design: Design, nominal: Prediction):
     wide = 0.02 * CAMERA.aperture_m
     narrow = predict(design, PROCESS, Variation(chrome_diameter_m=-wide))

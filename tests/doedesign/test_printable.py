@@ -46,6 +46,7 @@ def test_no_rule_is_ever_broken_and_little_is_lost(spec: Path, sets: list[str]) 
     assert 2 - last_losses(bound) > 0.8 * (2 - last_losses(free))
 
 
+@pytest.mark.slow
 def test_pixels_that_are_drawn_are_whole_cells(spec: Path) -> None:
     level = optimize(load_spec(spec, ["optimize.drawn_pixel=3.7 um", "optimize.steps=4"])).level_map
     inside = level.relief.inside(level.grid)

@@ -178,6 +178,7 @@ def test_the_list():
 # --- their ideas -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILLS_HOLES)
 def test_a_hole_is_filled_and_the_rest_is_kept(name: str):
     reference, picture, mask = scene()
@@ -257,6 +258,7 @@ def _answered(network: RivalNetwork, picture: jax.Array, mask: jax.Array) -> Ans
     return network(picture, mask)
 
 
+@pytest.mark.slow
 def test_attention_is_supervised():
     """By the mask in every round, in the last most."""
     network = drawn("attentive_drop_removal")

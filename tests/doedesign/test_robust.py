@@ -264,6 +264,7 @@ def test_listed_sources_on_the_axis_are_those_of_other_steps(spec: Path) -> None
     assert jax.tree.all(same)
 
 
+@pytest.mark.slow
 def test_a_robust_design_of_all_depths_and_angles(spec: Path) -> None:
     found = optimize(load_spec(spec, ["robust.depths=range", "robust.field=random", "optimize.steps=6"]))
     assert len(found.history) == 6 + 16

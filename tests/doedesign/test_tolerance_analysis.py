@@ -248,6 +248,7 @@ def test_sobol_indices_are_the_same_every_time_and_need_a_power_of_two(ask: Call
             ask().sobol(count)
 
 
+@pytest.mark.slow
 def test_the_budget_for_overlay_agrees_with_the_one_worked_out(ask: Callable[..., Study]):
     asked = ask(limits=["strehl >= 0.9"])
     # Strehl is 1 - (d0² + d1²) / 10 with shifts d in um: good where d0² + d1² <= 1, so the yield at sigma s is

@@ -22,6 +22,7 @@ def spec(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_plates_of_a_process_without_errors_are_as_drawn(spec: Path):
     found = compare_robust.plates_of("small", optimize(load_spec(spec)), "ideal", 3)
     # Two programs for the same plate: single precision.

@@ -61,6 +61,7 @@ def test_networks_are_judged_scene_by_scene(tmp_path: Path):
     assert [row[:4] for row in again] == [row[:4] for row in rows]
 
 
+@pytest.mark.slow
 def test_cases_without_lamps_and_of_a_chequerboard():
     study = small_study()
     dark, board = (case for case in CASES if not case.lit or case.cells_px)

@@ -33,6 +33,7 @@ def design() -> Design:
     return Design(LevelMap(level, levels, grid, 60 * PITCH_M, "blocks"), camera, (6e-3,), (np.inf,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [0.0, 1.0])
 def test_the_fab_s_light_is_the_library_s(design: Design, off: float):
     """Two simulators that share no code, for a plate as drawn and for one with every error that the fab has."""

@@ -125,6 +125,7 @@ def _shape_less(cell: Cell) -> Cell:
     return Cell(cell.name, {k: type(s)(s.rectangles[1:]) for k, s in cell.shapes.items()}, cell.references)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [_step_aside, _copy_less, _shape_less])
 def test_what_differs_in_an_array_is_found(written, tmp_path, change):
     folder = tmp_path / "order"

@@ -128,6 +128,7 @@ def test_orders_of_every_kind_verify(tmp_path, caplog, count, step_nm, shape, fi
     assert manifest.chrome.layer == max(5, levels.bits + 1)
 
 
+@pytest.mark.slow
 def test_edges_that_had_to_be_rounded_are_stated_and_verify(tmp_path, levels):
     grid = Grid((5, 7), 1e-6 / 3)
     rng = np.random.default_rng(1)

@@ -24,6 +24,7 @@ def random_map(rng: np.random.Generator) -> LevelMap:
     return LevelMap(rng.integers(0, 16, GRID.shape).astype(np.uint8), LEVELS, GRID, 116e-6, "a $name$ of one's own")
 
 
+@pytest.mark.slow
 def test_it_is_whole_and_repeatable(rng: np.random.Generator):
     level_map = random_map(rng)
     require_whole(level_map.plot())

@@ -93,6 +93,7 @@ def test_every_split_is_placed_five_times_and_bears_its_name(split):
     assert all(counts[f"{one.cell}_DIE"] == len(one.dies) == 5 for one in manifest.splits)
 
 
+@pytest.mark.slow
 def test_a_split_that_is_not_what_it_should_be_is_told_by_both_readers(split, tmp_path):
     folder = tmp_path / "order"
     shutil.copytree(split, folder)

@@ -92,6 +92,7 @@ def test_every_single_byte_of_a_mask_file_counts(order_folder):
         path.write_bytes(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", [MASKS[0], MASKS[4]])
 def test_a_missing_pixel_is_located_by_both_readers(order_folder, file):
     gone = []

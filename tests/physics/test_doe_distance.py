@@ -60,6 +60,7 @@ def missed(found: np.ndarray, wanted: np.ndarray) -> float:
     return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth_m", [DEPTH_M, np.inf])
 @pytest.mark.parametrize("defocus_m", [0.15e-3, -0.1e-3, 0.0])
 def test_a_doe_before_the_lens(defocus_m: float, depth_m: float):

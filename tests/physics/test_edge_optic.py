@@ -123,6 +123,7 @@ def test_a_doe_has_views_where_near_and_far_light_are_too_different():
     assert off(np.asarray(slope(plate)), np.asarray(own(plate))) < 0.02
 
 
+@pytest.mark.slow
 def test_cells_are_split_where_light_is_too_oblique_for_them():
     """The window ends at half a wave per cell, and the nearest source lights the rim with 0.28."""
     lens, height, depths = camera(64, 160, 1e-3), levels(64), (0.7e-3, np.inf)

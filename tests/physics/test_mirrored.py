@@ -55,6 +55,7 @@ def test_orders_are_those_of_another_library(along_x: bool):
         assert found.transmitted == pytest.approx(wanted.transmitted[int(not along_x)].sum(), abs=tolerance)
 
 
+@pytest.mark.slow
 def test_directions_are_those_of_another_library():
     fmmax = pytest.importorskip("fmmax")
     import jax
@@ -100,6 +101,7 @@ def test_other_layers_are_refused(permittivity: np.ndarray):
         layer(20).solve(permittivity, DEPTH_M, NO_WALLS, 1)
 
 
+@pytest.mark.slow
 def test_orders_near_the_limits_are_as_right_as_is_said():
     """100 terms grow by a factor of e^7 over 0.7 um, and light turns by 10 rad."""
     fmmax = pytest.importorskip("fmmax")

@@ -143,6 +143,7 @@ def off(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wavelength", "way", "walls_along", "shift", "bias"),
     [

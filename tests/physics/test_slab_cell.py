@@ -31,6 +31,7 @@ def order_of(cell: SlabCell, y: int, x: int) -> int:
 
 
 # At 3 waves the third order leaves along the face, where modes cannot be told apart: a Rayleigh anomaly.
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [3.0, 3.01])
 def test_a_row_is_what_coupled_waves_say(period: float):
     """Another solver, another treatment of walls; light along x is TM at walls across x."""
@@ -61,6 +62,7 @@ def test_bare_glass_lets_through_what_fresnel_says():
     assert orders.sum(1) == pytest.approx([face] * 2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_slab_with_a_share_of_glass_is_a_film_of_the_mean_permittivity():
     """A quarter of a wave of the index sqrt(n), of which the share follows, takes the reflection away."""
     share = (GLASS - 1) / (GLASS**2 - 1)

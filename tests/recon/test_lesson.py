@@ -26,6 +26,7 @@ def bench(model: Model) -> CaptureModel:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["paper", "radiometric"])
 def test_cells_say_what_an_even_obstruction_does(model: Model) -> None:
     """Half of the light kept off everywhere, before a plate that images a point as a point."""

@@ -156,6 +156,7 @@ def test_randomness_follows_from_seed_and_batch(joint: Trainer) -> None:
     assert not np.array_equal(here.far[0].sines, there.far[0].sines)
 
 
+@pytest.mark.slow
 def test_field_angles_stay_on_the_sensor(joint: Trainer) -> None:
     sines = [joint._seen(batch(step=k), 0, True)[0].far[0].sines[0] for k in range(200)]
     # 640 x 480 pixels of 1.85 um at 1 mm: angles (y, x) whose tangents are below half of that.

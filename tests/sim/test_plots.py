@@ -70,6 +70,7 @@ SLOW = ("psfs", "mtf", "split")
 NAMES = ("encircled", "pattern", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_picture_is_whole_and_the_same_whatever_the_user_has_set(name: str):
     drawn = plot(name)

@@ -29,6 +29,7 @@ def test_axes_are_wavelength_depth_y_x():
             np.testing.assert_array_equal(bank.energy[c, d], psf(HEIGHT, single, [depth]).energy[0, 0])
 
 
+@pytest.mark.slow
 def test_a_colour_is_the_weighted_sum_of_its_wavelengths():
     waves, weights = (5e-7, 5.5e-7, 6e-7), (0.2, 0.5, 0.3)
     mixed = dataclasses.replace(ONE, colours=(Colour("green", waves, weights),))

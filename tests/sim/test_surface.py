@@ -90,6 +90,7 @@ def test_without_errors_the_plate_is_as_drawn_bit_for_bit(level: np.ndarray, not
     assert surface.grid == GRID
 
 
+@pytest.mark.slow
 def test_without_errors_the_bank_is_that_of_the_height_map(level: np.ndarray):
     made = psf(plate(level, camera=ROUND), depths=[4e-3, np.inf])
     drawn = psf(height_of(level, LEVELS), ROUND, [4e-3, np.inf])

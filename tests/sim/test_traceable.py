@@ -111,6 +111,7 @@ def test_a_doe_as_fabricated():
     check(judged, 0.05e-6, 0.2, value=1e-3)
 
 
+@pytest.mark.slow
 def test_all_metrics_of_a_height_map():
     """The whole table of a DOE with no target; lengths, and the light that the chrome takes, are constants here."""
     whole = [metric for metric in METRICS.values() if not metric.aimed]
@@ -136,6 +137,7 @@ def test_all_metrics_of_a_height_map():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["throughput", "far_spot", "ring_to_disc", "participation", "encircled_energy"])
 def test_metrics_of_a_bank(name: str):
     bank = psf(HEIGHT_M, CAMERA, DEPTHS_M)
