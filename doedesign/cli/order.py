@@ -27,7 +27,7 @@ class Listed(NamedTuple):
 COMMANDS: Mapping[str, Listed] = {
     "new": Listed("Design", "new splitter --out my_splitter.toml"),
     "spec": Listed("Design", "spec optics.focal_length"),
-    "optimize": Listed("Design", "optimize examples/quick.toml --set process.levels=8 --budget 60"),
+    "optimize": Listed("Design", "optimize examples/quick.toml --set optimize.seed=2 --budget 60"),
     "refine": Listed("Design", "refine runs/cell --steps 100"),
     "masks": Listed("Masks", 'masks runs/quick --on-violation fix --patch "0 um, 0 um, 40 um"'),
     "verify": Listed("Masks", "verify masks/quick"),

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -166,16 +166,20 @@ class Design:
         depths_m = self.depths_m if depths is None else depths_from(depths)
         return as_fabricated(self.level_map.level, self.camera, made_by, errors, depths_m=depths_m)
 
-    def write_phase(self, path: "str | Path", wavelength: "str | float") -> None:
+    def write_phase(
+        self, path: "str | Path", wavelength: "str | float", *, side: Literal["exit", "entry"] = "entry"
+    ) -> None:
         """Write the phase of the design as a grid phase of Zemax OpticStudio (`fab.solids.height_files`).
 
         Args:
             path: the file, .DAT.
             wavelength: in vacuum, metres or with a unit. The phase is positive where light is late.
+            side: where the relief is: "entry" where it faces the light, "exit" where light leaves through it. The axes
+                of Zemax are right-handed, so that the map is mirrored for the former.
         """
         from fab.solids.height_files import write_zemax_phase
 
-        write_zemax_phase(path, self.level_map, float(self.camera.waves_per_metre(metres(wavelength))))
+        write_zemax_phase(path, self.level_map, float(self.camera.waves_per_metre(metres(wavelength))), side=side)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the level map; on `ax`, or on a new figure. Returns what it drew on."""

@@ -147,7 +147,7 @@ def evaluate(
         )
         needed = trainings_of(rows)
         if train:
-            train_missing(plan, needed, seeds)
+            train_missing(plan, needed, seeds, workers)
         missing = lacking(plan, needed, seeds)
         plates = plates_of(rows, plan, asked, seeds, missing, process, draws)
         ready, left = candidates_of(rows, plan, seeds, missing, plates, asked.files)

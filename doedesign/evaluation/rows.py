@@ -36,6 +36,11 @@ class Training:
     rival: str | None = None
     plate: str | None = None
 
+    @property
+    def after(self) -> str | None:
+        """Name of the training that comes before, whose plate this one stands behind; None without one."""
+        return None if self.plate == FLAT else self.plate
+
 
 @dataclass(frozen=True)
 class MethodRow:
@@ -200,8 +205,8 @@ def trainings_of(rows: Sequence[MethodRow]) -> tuple[Training, ...]:
 
     def add(name: str) -> None:
         one = TRAININGS[name]
-        if one.plate not in (None, FLAT):
-            add(one.plate)
+        if one.after is not None:
+            add(one.after)
         needed[name] = one
 
     for name in asked:

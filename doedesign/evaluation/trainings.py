@@ -4,22 +4,36 @@
 
 A finished training of the design's own run (`RUN/trained`, or a released model) with the same seed, occlusion model and
 obstruction stands for "proposed". All are trained on the same pictures, with the steps, sizes and seeds of the
-design's spec.
+design's spec. On a processor several are trained side by side, each by a process with one thread: a training leaves
+half of a second core idle, and more of a third.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import logging
+import os
+import threading
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+import jax
 
 from doedesign.design.design import Design
 from doedesign.evaluation.rivals.training import train_rival
-from doedesign.evaluation.rows import FLAT, ROBUST, Training
+from doedesign.evaluation.rows import ROBUST, Training
 from doedesign.recon.weights import NETWORK_NAME, read_network
 from doedesign.runs.folder import RELEASED, TRAINING_TABLES, open_run
 from doedesign.runs.level_maps import open_design
+from doedesign.runtime.pool import default_workers, evaluate_here
+from doedesign.runtime.progress import meter
+from doedesign.training.history import HISTORY_NAME
 from doedesign.training.train import train
 from fab.files import MANIFEST_NAME, read_json
+
+_TRAINING_BYTES = 4 << 30  # an estimate: a training at its peak, crops of 256 pixels
+_log = logging.getLogger("doedesign")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +87,8 @@ class TrainingPlan:
 
     def design(self, training: Training, seed: int) -> Design:
         """The design that a training begins with."""
-        if training.plate not in (None, FLAT):
-            source = self.folder(Training(training.plate), seed)
+        if training.after is not None:
+            source = self.folder(Training(training.after), seed)
         else:
             source = self.robust if training.name == ROBUST else self.run
         assert source is not None  # rows of a robust design come with one
@@ -92,17 +106,72 @@ def _is_finished(folder: Path) -> bool:
     return found.get("state") == "done" or found.get("format") == RELEASED
 
 
-def train_missing(plan: TrainingPlan, trainings: Iterable[Training], seeds: Sequence[int]) -> None:
-    """Train all that is not finished, seed by seed; a training that was stopped goes on.
+def train_missing(
+    plan: TrainingPlan, trainings: Iterable[Training], seeds: Sequence[int], workers: int | None = None
+) -> None:
+    """Train all that is not finished; a training that was stopped goes on.
+
+    Args:
+        plan: what they have in common.
+        trainings: the trainings.
+        seeds: seeds of each.
+        workers: how many to train side by side on a processor; as many as cores and memory allow if None, 0 or 1 for
+            one after the other in this process. Another device has one after the other.
 
     Raises:
         InputError: pictures or options that cannot be used.
-        KeyboardInterrupt: it was stopped; the same call goes on from there.
+        KeyboardInterrupt: it was stopped; the same call goes on from the last checkpoints.
     """
-    for seed in seeds:
-        for one in trainings:
-            if not plan.done(one, seed):
-                _train(plan, one, seed)
+    missing = [(one, seed) for seed in seeds for one in trainings if not plan.done(one, seed)]
+    most = default_workers(_TRAINING_BYTES) if workers is None else workers
+    if min(most, len(missing)) < 2 or jax.default_backend() != "cpu":
+        for one, seed in missing:
+            _train(plan, one, seed)
+        return
+    with _steps_shown(plan, missing):
+        for later in (False, True):
+            part = {f"{one.name}_{seed}": (one, seed) for one, seed in missing if (one.after is not None) == later}
+            for name, _ in evaluate_here(TrainingWork(plan), part, most):
+                _log.info("trained %s", name)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingWork:
+    """Trainings of a plan as work for processes of their own; called with a training and its seed."""
+
+    plan: TrainingPlan
+    noun: ClassVar[str] = "training"
+    token: str = field(default_factory=lambda: uuid.uuid4().hex)
+
+    def __call__(self, item: tuple[Training, int]) -> None:
+        """Train one."""
+        with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):  # the progress of all is shown together
+            _train(self.plan, *item)
+
+
+@contextmanager
+def _steps_shown(plan: TrainingPlan, missing: Sequence[tuple[Training, int]]) -> Iterator[None]:
+    """Show how many steps the trainings of other processes have taken, by the lines of their histories."""
+    spec = open_design(plan.run, False, overrides=plan.overrides, free=TRAINING_TABLES).spec
+    assert spec is not None  # every run has one
+    files, ended = [plan.folder(*each) / HISTORY_NAME for each in missing], threading.Event()
+
+    def done() -> int:
+        return sum(path.read_bytes().count(b"\n") for path in files if path.is_file())
+
+    with meter(f"steps of {len(missing)} trainings", spec.train.steps * len(missing), done()) as progress:
+
+        def watch() -> None:
+            while not ended.wait(1.0):
+                progress.advance(done())
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            watcher.join()
 
 
 def _train(plan: TrainingPlan, one: Training, seed: int) -> None:

@@ -9,6 +9,10 @@ The grid sag of Zemax OpticStudio is the text that its manual describes: one lin
 and then down row by row. Points are pixel centres. The derivatives are left 0; choose linear interpolation there, which
 does not use them, and know that it turns a vertical wall into a slope one pixel wide. A grid phase has the same form,
 with radians in the place of z; its unit flag is that of pitch and decentre alone.
+
+Its axes are right-handed with light toward +z: whoever looks along the light with +y up has +x on the left. A map is
+seen from the etched side. So x and y are those of the map where light leaves through the relief ("exit"); where it
+enters there ("entry"), as everywhere else in this package, the map is mirrored, x to -x.
 """
 
 import io
@@ -117,33 +121,41 @@ def write_zemax_sag(
     """Write the relief as a grid sag of Zemax OpticStudio (millimetres, file suffix .DAT).
 
     The blank surface is the vertex plane, sag 0. Light runs toward +z. On the exit side (glass before the surface) the
-    sag is minus the etch depth, on the entry side plus. x and y are those of the map in both cases; a plate that is
-    turned over must be mirrored in the optics program. A point takes 22 bytes: a 4400 x 4400 map makes 426 MB, so
-    choose a window (at least 5 pixels either way); the decentre in the header puts it where it is.
+    sag is minus the etch depth; on the entry side it is plus the etch depth, and the map is mirrored in x. A point
+    takes 22 bytes: a 4400 x 4400 map makes 426 MB, so choose a window (at least 5 pixels either way); the decentre in
+    the header puts it where it is.
     """
-    _write_grid(Path(path), level_map, _sag_lines(level_map.levels, side), window)
+    _write_grid(Path(path), level_map, _sag_lines(level_map.levels, side), window, side)
 
 
 def write_zemax_phase(
-    path: str | Path, level_map: LevelMap, waves_per_metre: float, window: PixelWindow | None = None
+    path: str | Path,
+    level_map: LevelMap,
+    waves_per_metre: float,
+    window: PixelWindow | None = None,
+    side: Literal["exit", "entry"] = "entry",
 ) -> None:
     """Write the phase of the relief as a grid phase of Zemax OpticStudio (radians, file suffix .DAT).
 
     The deepest floor has phase 0, higher glass a positive one: it is positive where light is late, so that a lens that
-    makes light converge falls toward its rim. It is not wrapped. As light runs toward +z through a flat surface, x and
-    y are those of the map. Check the sign in the program's own plot of the surface's phase with a lens.
+    makes light converge falls toward its rim. It is not wrapped. Check the sign in the program's own plot of the
+    surface's phase with a lens.
 
     Args:
         path: the file.
         level_map: the relief.
         waves_per_metre: of height, (n - 1) / wavelength for glass in air (`sim.Camera.waves_per_metre`).
         window: part of the map, at least 5 pixels either way; the decentre in the header puts it where it is.
+        side: where the relief is: "entry" where it faces the light, which mirrors the map in x; "exit" where light
+            leaves through it.
     """
     phase = 2 * np.pi * waves_per_metre * level_map.levels.heights_m()
-    _write_grid(Path(path), level_map, [f"{radians:14.9f} 0 0 0 0\r\n" for radians in phase], window)
+    _write_grid(Path(path), level_map, [f"{radians:14.9f} 0 0 0 0\r\n" for radians in phase], window, side)
 
 
-def _write_grid(path: Path, level_map: LevelMap, lines: list[str], window: PixelWindow | None) -> None:
+def _write_grid(
+    path: Path, level_map: LevelMap, lines: list[str], window: PixelWindow | None, side: Literal["exit", "entry"]
+) -> None:
     """Write a grid of OpticStudio from the line of a point of every level."""
     if path.suffix.upper() != ".DAT":
         raise InputError(str(path), "OpticStudio reads grids from .DAT files", path.suffix, "Use .DAT.")
@@ -156,8 +168,10 @@ def _write_grid(path: Path, level_map: LevelMap, lines: list[str], window: Pixel
     table = np.frombuffer("".join(lines).encode(), dtype=np.uint8).reshape(len(lines), -1)
     x_mm, y_mm = (value / MM for value in window.centre_m(grid))
     pitch_mm = f"{grid.pitch_m / MM:.12g}"
-    header = f"{window.columns} {window.rows} {pitch_mm} {pitch_mm} 0 {x_mm:.12g} {y_mm:.12g}\r\n"
     pixels = window.cut(level_map.level)[::-1]
+    if side == "entry":
+        pixels, x_mm = pixels[:, ::-1], -x_mm + 0.0  # + 0.0: no minus before a zero
+    header = f"{window.columns} {window.rows} {pitch_mm} {pitch_mm} 0 {x_mm:.12g} {y_mm:.12g}\r\n"
     body = (table[pixels[start : start + _ROWS]].tobytes() for start in range(0, window.rows, _ROWS))
     write_atomic(path, b"".join([header.encode(), *body]))
 

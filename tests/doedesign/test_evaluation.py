@@ -25,7 +25,7 @@ from doedesign.evaluation.plates import PlateBanks
 from doedesign.evaluation.published import TABLE_1, TABLE_2
 from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow, rows_of, trainings_of
 from doedesign.evaluation.statistics import bootstrap_mean
-from doedesign.evaluation.trainings import TrainingPlan
+from doedesign.evaluation.trainings import TrainingPlan, train_missing
 from doedesign.recon.weights import NETWORK_NAME
 from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.level_maps import open_design
@@ -446,6 +446,25 @@ def test_networks_are_trained_scored_and_kept(run: Path, tmp_path: Path):
     by_name = {row["name"]: row for row in told["rows"]}
     assert by_name["proposed_fabricated"]["gain_over_proposed"]["full"]["psnr"]["mean"] != 0
     assert by_name["proposed"]["paper"]["psnr"] == TABLE_2["dirt"]["proposed"].psnr
+
+
+@pytest.mark.slow
+def test_trainings_side_by_side_are_those_one_after_the_other(run: Path, tmp_path: Path, capfd: Any):
+    """By processes of one thread each: the same networks but for the order of sums; the second waits for its plate."""
+    trainings, networks = [TRAININGS[name] for name in ("proposed", "plain_unet")], []
+    for name, workers in (("beside", 2), ("after", 0)):
+        plan = TrainingPlan(run, tmp_path / name, "paper", "dirt")
+        train_missing(plan, trainings, (0,), workers)
+        assert all(plan.done(one, 0) for one in trainings)
+        networks.append([np.load(plan.folder(one, 0) / NETWORK_NAME, allow_pickle=False) for one in trainings])
+        told = capfd.readouterr().err
+        assert ("steps of 2 trainings: 4/4" in told) == (workers == 2)
+        assert ("training: 2/2" in told) == (workers == 0)
+    for beside, after in zip(*networks, strict=True):
+        arrays = [key for key in after.files if after[key].dtype.kind == "f"]
+        assert arrays
+        for key in arrays:
+            np.testing.assert_allclose(beside[key], after[key], rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -107,17 +107,20 @@ def test_a_grid_sag_is_the_etch_depth_below_the_blank_surface(tmp_path, side, si
     sag_mm = table[:, 0].reshape(7, 10)[::-1]
     depth_mm = (15 - level_map.level.astype(float)) * 75e-6
     # Nine decimals of a millimetre hold whole picometres, which 75 nm steps are.
-    assert np.allclose(sag_mm, sign * depth_mm, rtol=0, atol=1e-15)
+    assert np.allclose(sag_mm, sign * (depth_mm if side == "exit" else depth_mm[:, ::-1]), rtol=0, atol=1e-15)
 
 
-def test_a_grid_phase_is_positive_where_there_is_more_glass(tmp_path):
+@pytest.mark.parametrize("side", ["exit", "entry"])
+def test_a_grid_phase_is_positive_where_there_is_more_glass(tmp_path, side):
     level_map = some_map()
-    write_zemax_phase(tmp_path / "p.DAT", level_map, 0.46 / 550e-9)
+    write_zemax_phase(tmp_path / "p.DAT", level_map, 0.46 / 550e-9, side=side)
     with open(tmp_path / "p.DAT", encoding="ascii") as file:
         assert [float(v) for v in file.readline().split()] == [10, 7, 1.85e-3, 1.85e-3, 0, 0, 0]
     table = np.loadtxt(tmp_path / "p.DAT", skiprows=1)
     assert not table[:, 1:].any()
     radians = table[:, 0].reshape(7, 10)[::-1]
+    if side == "entry":  # axes of Zemax are right-handed: +x is on the left along the light
+        radians = radians[:, ::-1]
     # Nine decimals.
     assert np.allclose(radians, 2 * np.pi * 0.46 / 550e-9 * 75e-9 * level_map.level, rtol=0, atol=6e-10)
     with pytest.raises(InputError, match="DAT"):
@@ -137,6 +140,8 @@ def test_a_window_of_a_grid_sag_lies_where_it_is_on_the_plate(tmp_path):
     assert np.allclose(points_y * 1e-3, GRID.axis_m("y")[1:7], rtol=0, atol=1e-14)
     sag_mm = np.loadtxt(tmp_path / "s.dat", skiprows=1)[:, 0].reshape(6, 5)[::-1]
     assert np.allclose(sag_mm, (level_map.level[1:7, 4:9] - 15.0) * 75e-6, rtol=0, atol=1e-15)
+    write_zemax_sag(tmp_path / "entry.dat", level_map, window, side="entry")
+    assert np.loadtxt(tmp_path / "entry.dat", max_rows=1)[5:] == pytest.approx([-x_mm, y_mm], abs=1e-14)
     x_m, y_m = window.edges_m(GRID)
     assert np.allclose((x_m[1:] + x_m[:-1]) / 2, GRID.axis_m("x")[4:9], rtol=0, atol=1e-18)
     assert np.allclose((y_m[1:] + y_m[:-1]) / 2, GRID.axis_m("y")[1:7], rtol=0, atol=1e-18)
