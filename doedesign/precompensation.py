@@ -293,7 +293,7 @@ def _repeating(process: Process, spec: Spec, random: Sequence[str]) -> Process:
     if not random:
         return process
     usual = process_from_spec(spec.process).spreads
-    anew = {name: usual.get(name, Normal()) for name in chosen_names(process.masks, random)}
+    anew = {name: usual.get(name, Normal()) for name in chosen_names(process.masks, random, "random")}
     return replace(process, spreads={**process.spreads, **anew})
 
 

@@ -22,6 +22,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,7 +217,9 @@ def variation_at(process: Process, seed: int, plate_m: float, key: str) -> Varia
     Raises:
         InputError: no such key in a study of this process.
     """
-    cause = None
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+        raise InputError("seed", "must be a whole number of 0 or more", seed, "Change it.")
+    seed, cause = int(seed), None
     try:
         match key.split("/"):
             case ["nominal"]:

@@ -48,13 +48,19 @@ class GaussianBeam:
     angle_rad: Pair = (0.0, 0.0)
     tilt_rad: Pair = (0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        if not all(1 <= quality < np.inf for quality in self.m_squared):
+            raise ValueError(f"`m_squared` must be at least 1 and finite, but got {self.m_squared}")
+
     @cached_property
     def _modes(self) -> list[tuple[float, int, int]]:
         """Share and numbers (y, x) of every mode, the strongest first."""
         axes = []
         for quality in self.m_squared:
             ratio = (quality - 1) / (quality + 1)
-            axes.append([(1 - ratio) * ratio**n for n in range(1 if ratio == 0 else 200)])
+            # Of either axis less than a quarter of what may be left out is missing.
+            count = 1 if ratio == 0 else max(200, int(np.ceil(np.log(_REST / 4) / np.log(ratio))))
+            axes.append([(1 - ratio) * ratio**n for n in range(count)])
         every = [(p * q, m, n) for m, p in enumerate(axes[0]) for n, q in enumerate(axes[1])]
         every.sort(key=lambda each: (-each[0], each[1:]))
         total = np.cumsum([share for share, _, _ in every])

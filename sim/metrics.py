@@ -94,7 +94,6 @@ class RingToDisc(NamedTuple):
     ring: Number
     disc: Number
     disc_radius_m: float
-    window_half_m: float
 
 
 def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
@@ -110,7 +109,7 @@ def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
         ratio = jnp.where(disc > 0, ring / jnp.where(disc > 0, disc, 1.0), jnp.inf)
     else:
         ratio = ring / disc if disc > 0 else np.inf
-    return RingToDisc(ratio, ring, disc, radius, camera.window * camera.pixel_m / 2)
+    return RingToDisc(ratio, ring, disc, radius)
 
 
 def far_spot(psf: Psf, camera: Camera, colour: Colour) -> Number:

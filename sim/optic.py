@@ -10,7 +10,7 @@ and the source's phase (`plan`, `source`); `energy` turns both into pixel energi
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -149,6 +149,8 @@ class CellOptic(CameraOptic):
                 sampling=sampling,
                 field_rad=self.camera.chief_rad(field_rad) if self.camera.sees_field else ON_AXIS,
             )
+        if propagation not in get_args(Propagation):
+            raise ValueError(f"`propagation` must be one of {get_args(Propagation)}, but got {propagation!r}")
         return plan_direct(self.camera, line.wavelength_m, propagation)
 
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> CellSource:
@@ -167,11 +169,11 @@ class CellOptic(CameraOptic):
         return plan.energy(doe_field, *self.rows(line, source))
 
     def with_camera(self, camera: Camera) -> "CellOptic":
-        """The same DOE before another lens or sensor; a ValueError for another aperture or substrate."""
+        """The same DOE before another lens or sensor; a ValueError for another aperture, substrate or kind of light."""
         own = self.camera
-        if (camera.opening, camera.material) != (own.opening, own.material):
-            wanted, got = f"{own.opening} of {own.material}", f"{camera.opening} of {camera.material}"
-            raise ValueError(f"`camera` must have the DOE's aperture and substrate, {wanted}, but got {got}")
+        wanted, got = (f"{each.opening} of {each.material}, {each.light} light" for each in (own, camera))
+        if (camera.opening, camera.material, camera.light) != (own.opening, own.material, own.light):
+            raise ValueError(f"`camera` must have the DOE's aperture, substrate and light, {wanted}, but got {got}")
         return replace(self, camera=replace(camera, grid=own.grid))
 
     def field(self, line: SpectralLine, depth_m: float = np.inf) -> Complex[Array, "y x"]:
@@ -333,6 +335,8 @@ class RingOptic(CameraOptic):
         """The path to every sub-ring, from the axis only."""
         if any(field_rad):
             raise ValueError(f"`field_rad` must be (0, 0) for rings, but got {field_rad}")
+        if self.camera.incident(line) is not None:
+            raise ValueError("`camera` must be lit evenly for rings, but got a beam; draw them on the grid (`raster`)")
         waves = ring_source_waves(self.camera, depth_m, line.wavelength_m)
         return SourceMap(jnp.asarray(waves), jnp.float32(self.camera.waves_per_metre(line.wavelength_m)))
 

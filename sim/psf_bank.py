@@ -212,8 +212,9 @@ def optic_of(optic: Any, camera: Camera | None = None, depths_m: Sequence[float]
 
     It is ready for sources at some depths, metres.
 
-    A ValueError for a map without a camera, or a camera of another grid, aperture or substrate; a TypeError for a
-    camera beside an optic that is not made of cells.
+    A ValueError for a map without a camera or of another shape than its grid, or a camera of another aperture,
+    substrate or kind of light than the optic's, which keeps its own grid; a TypeError for a camera beside an optic that
+    is not made of cells.
     """
     if hasattr(optic, "as_optic"):
         found: Optic = optic.as_optic()
@@ -228,9 +229,12 @@ def optic_of(optic: Any, camera: Camera | None = None, depths_m: Sequence[float]
 
 
 def depths_from(depths: Length | Sequence[Length]) -> tuple[float, ...]:
-    """One depth or several, in metres or with a unit ("5 mm", "inf"), in metres."""
+    """One depth or several, positive, in metres or with a unit ("5 mm", "inf"), in metres."""
     given: Any = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
-    return tuple(metres(depth, "depth", infinite=True) for depth in given)
+    found = tuple(metres(depth, "depth", infinite=True) for depth in given)
+    if not found or not all(depth > 0 for depth in found):
+        raise InputError("depths", "must be positive, at least one", str(given), 'For example "5 cm", or inf.')
+    return found
 
 
 def psf(

@@ -5,8 +5,9 @@ side do not.
 """
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import TypeVar
 
 _MOST = 8  # each holds a field of its own
@@ -38,14 +39,25 @@ def side_by_side() -> int:
 def at_once(work: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
     """`work` of every item, in their order, several at once; none may be part of a trace.
 
-    After an error no further item is begun.
+    After an error no further item is begun. Settings that jax keeps for a thread (`jax.enable_x64`, `jax.debug_nans`,
+    `jax.default_device` as context managers) do not reach the work.
     """
-    count = min(side_by_side(), len(items))
+    count, failed = min(side_by_side(), len(items)), threading.Event()
     if count < 2:
         yield from map(work, items)
         return
+
+    def unless_failed(item: _Item) -> _Result:
+        if failed.is_set():  # the error of an earlier item is raised before anybody asks for this one
+            raise CancelledError
+        try:
+            return work(item)
+        except BaseException:
+            failed.set()
+            raise
+
     pool = ThreadPoolExecutor(count)
     try:
-        yield from pool.map(work, items)
+        yield from pool.map(unless_failed, items)
     finally:
         pool.shutdown(cancel_futures=True)

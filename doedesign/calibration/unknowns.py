@@ -123,8 +123,8 @@ def _key(name: str) -> str:
     return name.partition("[")[0]
 
 
-def chosen_names(masks: int, errors: Sequence[str]) -> tuple[str, ...]:
-    """Flat names of the errors that some words mean (`unknowns_of`), in the order of `DEVIATIONS`.
+def chosen_names(masks: int, errors: Sequence[str], where: str = "errors") -> tuple[str, ...]:
+    """Flat names of the errors that some words mean (`unknowns_of`), in the order of `DEVIATIONS`; `where` they stand.
 
     Raises:
         InputError: an unknown error, one that no single DOE has in a definite way, or a mask that is not there.
@@ -138,11 +138,11 @@ def chosen_names(masks: int, errors: Sequence[str]) -> tuple[str, ...]:
             choices = [short_name(k) for k in _KNOWABLE] + sorted({DEVIATIONS[k].source for k in _KNOWABLE})
             close = get_close_matches(word, choices, n=1)
             cure = f"Did you mean {close[0]}?" if close else f"One of {', '.join(choices)}."
-            raise InputError("errors", "must be an error that a plate has in a definite way", error, cure)
+            raise InputError(where, "must be an error that a plate has in a definite way", error, cure)
         names = [f"{key}[{mask}" for key in keys] if bracket else error_names(masks, *keys)
         if not set(names) <= set(known):
             rule = f"must be an error of the plate, or of one of the masks 0 to {masks - 1}"
-            raise InputError("errors", rule, error, "Correct the number in brackets.")
+            raise InputError(where, rule, error, "Correct the number in brackets.")
         chosen.update(names)
     return tuple(name for name in known if name in chosen)
 

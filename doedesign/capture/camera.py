@@ -1,5 +1,6 @@
 """From light to a developed capture: the part of a camera that is the same whatever optic it has."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,3 +109,9 @@ def depth_range_m(kind: Any) -> tuple[float, float]:
         return float(depth[0]), float(depth[1])
     inner = [depth_range_m(getattr(kind, name)) for name in ("dirt", "raindrop", "fence") if hasattr(kind, name)]
     return min(low for low, _ in inner), max(high for _, high in inner)
+
+
+def middle_depth_m(depths_m: Sequence[float]) -> float:
+    """Depth, metres, in the middle of several in 1/z: the nearest is as much out of focus there as the farthest."""
+    near, far = min(depths_m), max(depths_m)
+    return near if near == far else 2 / (1 / near + 1 / far)

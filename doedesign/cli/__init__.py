@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted. Heavy packag
 that --help answers at once.
 """
 
+import sys
 from collections.abc import Sequence
 from inspect import signature
 
@@ -82,4 +83,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the `doedesign` command."""
     given = (p for command in _COMMANDS for p in signature(command).parameters.values())
     options = frozenset(p.name.rstrip("_") for p in given if p.kind is p.KEYWORD_ONLY)
-    return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False), options)
+    words = sys.argv[1:] if arguments is None else arguments
+    return exit_code(lambda: app(words, exit_on_error=False, print_error=False), options, words)

@@ -71,13 +71,19 @@ def print_results(folder: Path, as_json: bool, **more: Any) -> None:
     print_paths([folder, *sorted(folder.iterdir())], as_json, **more)
 
 
-def exit_code(work: Callable[[], Any], options: Collection[str] = ()) -> int:
-    """Run a command and return its exit code; a mistake of the user becomes one message instead of a traceback."""
+def exit_code(work: Callable[[], Any], options: Collection[str] = (), given: Collection[str] = ()) -> int:
+    """Run a command and return its exit code; a mistake of the user becomes one message instead of a traceback.
+
+    `options` are the names of arguments that are options, `given` the words of the command line.
+    """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # whoever started it closed it
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         with interruptible(), shown_log():
             work()
     except InputError as error:
-        say(f"doedesign: {in_options(error, options)}")
+        say(f"doedesign: {in_options(error, options, given)}")
         return 2
     except CheckFailed as error:
         say(f"doedesign: check failed\n{error}")

@@ -10,6 +10,8 @@ from doedesign.cli.console import print_paths, print_results
 from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
 
+FIRST_DRAW = "normal/0"
+
 
 def psf(
     run: Path,
@@ -21,7 +23,7 @@ def psf(
     process: str | None = None,
     variation: Path | None = None,
     seed: int | None = None,
-    draw: str = "normal/0",
+    draw: str | None = None,
     json_: AsJson = False,
 ) -> None:
     """Compute PSF banks and pictures of the continuous, the quantised and the drawn design.
@@ -38,10 +40,12 @@ def psf(
         process: TOML file with a [process] table, or the name of a stock process; the run's own by default.
         variation: TOML file with the errors of the plate.
         seed: Draw the errors of the plate from the process.
-        draw: Which draw of the seed, as in a tolerance study.
+        draw: Which draw of the seed, as in a tolerance study; normal/0 by default.
     """
     from doedesign.runs.costs import measured
 
+    if draw is not None and seed is None:
+        raise InputError("--draw", "must be given with --seed", draw, "Add --fabricated and --seed, or leave it out.")
     if fabricated:
         if depths or any(field_deg):
             option = "--depths" if depths else "--field-deg"
@@ -51,7 +55,7 @@ def psf(
 
         folder = run / "fabricated"
         with measured(run, "psf") as taken:
-            predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, out=folder)
+            predict(run, masks, process=process, variation=variation, seed=seed, draw=draw or FIRST_DRAW, out=folder)
         print_results(folder, json_)
         say_closing(folder, run, taken)
         return
@@ -118,7 +122,7 @@ def simulate(
     process: str | None = None,
     variation: Path | None = None,
     plate_seed: int | None = None,
-    draw: str = "normal/0",
+    draw: str | None = None,
     masks: Path | None = None,
     png: Flag = False,
     set_: Overrides = (),
@@ -142,13 +146,15 @@ def simulate(
             default.
         variation: With --fabricated, a TOML file with the errors of the plate.
         plate_seed: With --fabricated, draw the errors of the plate from the process.
-        draw: With --plate-seed, which draw, as in a tolerance study.
+        draw: With --plate-seed, which draw, as in a tolerance study; normal/0 by default.
         masks: The run's mask order; masks/NAME by default.
         png: Write 16-bit PNG instead of EXR.
     """
     if not fabricated and (process is not None or variation is not None or plate_seed is not None):
         rule = "must be given with --process, --variation or --plate-seed"
         raise InputError("--fabricated", rule, "not there", "Add it.")
+    if draw is not None and plate_seed is None:
+        raise InputError("--draw", "must be given with --plate-seed", draw, "Add that, or leave it out.")
     from doedesign.capture.folder import PlateErrors, simulate_files
     from doedesign.runs.costs import measured
     from doedesign.runs.level_maps import open_design
@@ -156,7 +162,7 @@ def simulate(
     design, plate = open_design(run, masks, overrides=set_), None
     if fabricated:
         made_by = design.process(process)
-        plate = PlateErrors(made_by, *design.plate_errors(made_by, variation, plate_seed, draw))
+        plate = PlateErrors(made_by, *design.plate_errors(made_by, variation, plate_seed, draw or FIRST_DRAW))
     how = {"obstruction": obstruction, "occlusion": occlusion, "count": count, "seed": seed, "size": size, "png": png}
     folder = out or run / "simulated"
     with measured(run, "simulate", writes=folder) as taken:

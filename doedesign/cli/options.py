@@ -80,17 +80,18 @@ _OPTIONS = {
 }
 
 
-def in_options(error: InputError, options: Collection[str] = ()) -> str:
+def in_options(error: InputError, options: Collection[str] = (), given: Collection[str] = ()) -> str:
     """Message of an error with command-line options in place of the library's arguments.
 
     Args:
         error: the error.
         options: names of arguments that are options.
+        given: words of the command line; one of them is a path, whatever option has its name.
     """
     text = str(error)
     # Where values have rules of a spec, its key follows the argument.
     where = "depths_m" if error.where.startswith("depths_m: ") else error.where
-    if where in _PLACES or where in options:
+    if where not in given and (where in _PLACES or where in options):
         text = _PLACES.get(where, f"--{where.replace('_', '-')}") + text.removeprefix(where)
     return words_in_options(text)
 

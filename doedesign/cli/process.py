@@ -19,10 +19,10 @@ def tolerance(
     draws: int = 100,
     seed: int = 0,
     sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time",
-    sobol: int = 64,
+    sobol: int | None = None,
     corners: Flag = False,
     budget: str | None = None,
-    yield_: Annotated[float, Parameter(name="--yield")] = 0.9,
+    yield_: Annotated[float | None, Parameter(name="--yield")] = None,
     limit: Texts = (),
     process: str | None = None,
     masks: Path | None = None,
@@ -39,10 +39,10 @@ def tolerance(
         draws: Plates of the Monte-Carlo study, and per point of the budget.
         seed: Seed of every draw.
         sensitivity: Which errors matter, each alone or as shares of variance.
-        sobol: Rows of the samples behind Sobol indices, a power of two; each costs sources + 2 plates.
+        sobol: Rows of the samples behind Sobol indices, a power of two, 64 by default; each costs sources + 2 plates.
         corners: Look at worst-case corners, too.
         budget: Errors for which the largest sigma is sought, such as overlay, overlay_x or overlay_x[3].
-        yield_: Yield that the budget is for.
+        yield_: Yield that the budget is for; 0.9 by default.
         limit: What a good plate obeys, such as "zeroth_order <= 5 %"; the spec's limits by default.
         process: TOML file with a [process] table, or the name of a stock process; the run's own by default.
         masks: Its mask order; masks/NAME by default.
@@ -51,6 +51,15 @@ def tolerance(
         scheduler: Address of a Dask scheduler whose workers are taken instead.
         out: Folder; RUN/tolerance by default. The same command resumes a stopped study.
     """
+    alone = draw is not None
+    for option, given, needs, there in (
+        ("--sobol", sobol is not None, "be given with --sensitivity sobol", sensitivity == "sobol" and not alone),
+        ("--yield", yield_ is not None, "be given with --budget", budget is not None and not alone),
+        ("--budget", budget is not None, "be left out with --draw", not alone),
+        ("--corners", corners, "be left out with --draw", not alone),
+    ):
+        if given and not there:
+            raise InputError(option, f"must {needs}", "a value", "Leave it out, or change the other.")
     settings: dict[str, Any] = {"process": process, "limits": limit or None, "seed": seed, "masks": masks}
     if draw is not None:
         print_text(_one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
@@ -59,9 +68,10 @@ def tolerance(
     from doedesign.tolerancing.results import tolerance as study
 
     folder = out or run / "tolerance"
-    settings |= {"draws": draws, "sensitivity": sensitivity, "sobol": sobol, "corners": corners, "budget": budget}
+    settings |= {"draws": draws, "sensitivity": sensitivity, "corners": corners, "budget": budget}
+    settings |= {"sobol": 64 if sobol is None else sobol, "wanted": 0.9 if yield_ is None else yield_}
     with measured(run, "tolerance", writes=folder) as taken:
-        study(run, **settings, wanted=yield_, out=folder, workers=workers, scheduler=scheduler)
+        study(run, **settings, out=folder, workers=workers, scheduler=scheduler)
     print_results(folder, json_, results=str(folder / "results.json"))
     say_closing(folder, run, taken)
 

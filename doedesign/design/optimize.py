@@ -233,7 +233,7 @@ def steps(
             printed = rules.nearer(level, np.asarray(wanted))
             state = state._replace(parameters=parameters, adam=adam, step=step + 1, printed=printed)
         if not np.isfinite(float(loss)):
-            cure = "Lower the learning rate."
+            cure = "Lower optimize.learning_rate." if step else "Lower the weight of an objective."
             raise InputError(f"optimize, step {step}", "the loss must stay finite", float(loss), cure)
         record = {"step": step, "loss": float(loss), "terms": [float(term) for term in terms], "names": names}
         yield state, record
@@ -269,7 +269,7 @@ def finished_design(
     continuous = problem.optic.raster(np.asarray(parametrization.cells(drawn)))
     levels = parametrization.levels
     if spec.process.chooses_depths:
-        levels = _chosen_levels(spec, problem, state, continuous)
+        levels = _chosen_levels(problem, state, continuous)
     if problem.optic.shape == continuous.shape and not spec.process.chooses_depths:
         level = np.asarray(parametrization.cells(jnp.asarray(_last_level(spec, problem, state))))
     else:
@@ -291,9 +291,7 @@ def _printed(
     )
 
 
-def _chosen_levels(
-    spec: Spec, problem: Problem, state: OptimizationState, continuous_m: Float[np.ndarray, "y x"]
-) -> Levels:
+def _chosen_levels(problem: Problem, state: OptimizationState, continuous_m: Float[np.ndarray, "y x"]) -> Levels:
     """Return the chosen staircase as a recipe holds it: the one learnt, or that which suits the heights best."""
     parametrization, camera = problem.parametrization, problem.camera
     start = parametrization.levels

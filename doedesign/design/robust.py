@@ -136,7 +136,11 @@ class RobustTask(NamedTuple):
         """Round and place of the worst plate of a round that has ended; -1 before the first one."""
         if round_ < 0:
             return np.full(2, -1, np.int32)
-        place = int(np.argmax(state.losses))
+        looks = np.zeros_like(state.losses)
+        for step in range(ROUND):
+            seen = self.seen(step)[0]
+            looks[seen.start : seen.stop] += 1
+        place = int(np.argmax(state.losses / np.maximum(looks, 1)))
         if place == self.robust.draws - 1 > 1 and state.worst[0] >= 0:
             return state.worst  # it was there from an earlier round
         return np.array([round_, place], np.int32)
@@ -153,8 +157,9 @@ class RobustTask(NamedTuple):
 
     def _variation(self, round_: int, place: int) -> Variation:
         seed = [self.spec.optimize.seed, _SALT, round_, place // 2]
-        scores = np.random.default_rng(seed).standard_normal(len(varying(self.process)))
-        return draw_at(self.process, scores if place % 2 == 0 else -scores, place)
+        rng = np.random.default_rng(seed)
+        scores, roughness = rng.standard_normal(len(varying(self.process))), int(rng.integers(2**31))
+        return draw_at(self.process, *((scores, roughness) if place % 2 == 0 else (-scores, roughness + 1)))
 
     def look(self, step: int) -> StepSources:
         """Sources of a step: those of other steps, or others about them."""

@@ -162,8 +162,10 @@ def _steps_shown(plan: TrainingPlan, missing: Sequence[tuple[Training, int]]) ->
     with meter(f"steps of {len(missing)} trainings", spec.train.steps * len(missing), done()) as progress:
 
         def watch() -> None:
+            seen = -1
             while not ended.wait(1.0):
-                progress.advance(done())
+                if (count := done()) != seen:
+                    progress.advance(seen := count)
 
         watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from doedesign.overview.kinds import record_of
+from doedesign.overview.listing import require_whole
 from doedesign.overview.numbers import MainNumber, main_numbers, number_text
 from doedesign.runs.costs import Cost, costs_of, together
 from doedesign.spec import load_spec, spec_to_toml
@@ -81,7 +82,7 @@ def compare_results(folders: Sequence[Path]) -> Comparison:
         folders: two folders or more, of one kind.
 
     Raises:
-        InputError: fewer than two; one that holds no results, unfinished ones, or results of another kind.
+        InputError: fewer than two; one that holds no results, unfinished or damaged ones, or results of another kind.
     """
     if len(folders) < 2:
         raise InputError("folders", "must be two or more", len(folders), "Give a second folder.")
@@ -92,6 +93,7 @@ def compare_results(folders: Sequence[Path]) -> Comparison:
             raise InputError(str(folder), rule, record.kind, "Compare results of one kind.")
         if not record.finished:
             raise InputError(str(folder), "must be finished", "unfinished results", "Resume it by the same command.")
+        require_whole(folder, record)
     found = [main_numbers(folder, record) for folder, record in zip(folders, records, strict=True)]
     return Comparison(
         tuple(folders),

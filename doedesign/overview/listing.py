@@ -138,9 +138,12 @@ def entry_of(folder: Path, depth: int = 0) -> Entry:
 
 def _state(folder: Path, record: Record) -> tuple[str, str]:
     try:
-        return ("done", "") if record.finished and not _wrong(folder, record) else _unfinished(folder, record)
+        if not record.finished:
+            return _unfinished(folder, record)
+        require_whole(folder, record)
     except InputError as error:
         return "damaged", _relative(str(error), folder)
+    return "done", ""
 
 
 def _relative(text: str, folder: Path) -> str:
@@ -148,8 +151,12 @@ def _relative(text: str, folder: Path) -> str:
     return text.replace(f"{folder}/", "").replace(str(folder), folder.name)
 
 
-def _wrong(folder: Path, record: Record) -> str:
-    """Nothing; a file that is missing or was changed since it was written is an error.
+def require_whole(folder: Path, record: Record) -> None:
+    """Refuse results of which a file is missing or was changed since it was written.
+
+    Args:
+        folder: the folder.
+        record: its record.
 
     Raises:
         InputError: there is such a file.
@@ -164,7 +171,6 @@ def _wrong(folder: Path, record: Record) -> str:
             raise InputError(str(folder / name), "must be there", "no such file", _CURE)
         if sha256_file(folder / name) != digest:
             raise InputError(str(folder / name), "must be the file that was written", "a changed file", _CURE)
-    return ""
 
 
 def _unfinished(folder: Path, record: Record) -> tuple[str, str]:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 import doedesign
+from doedesign.capture.camera import middle_depth_m
 from doedesign.capture.from_spec import LUMINANCE, longest_first
 from doedesign.capture.simulate import SimulatedCapture
 from doedesign.recon.network import Network
@@ -172,7 +173,7 @@ class Model:
         Raises:
             InputError: files that cannot be used, or a depth beyond a bank's.
         """
-        near_m = 2 / (1 / min(self.near_m) + 1 / max(self.near_m)) if near_m is None else near_m
+        near_m = middle_depth_m(self.near_m) if near_m is None else near_m
         if not files:
             own_m = next((z for z in (far_m, self.far_m) if z is not None), max(self.bank.depths_m))
             return _pair(self.bank, self.bank, own_m, near_m)

@@ -13,6 +13,11 @@ What a file is about has to say which camera it was trained for, in these keys; 
     pixel_m         pixel pitch, metres
     near_m          depths of obstructions it was trained on, metres
 
+and may say
+
+    far_m           distance of the scene that it is told of where nobody states another, metres; the farthest of its
+                    PSFs without
+
 Anything else that JSON can say may stand beside them: digests of spec and design, occlusion model, pictures, licences.
 """
 

@@ -320,7 +320,7 @@ FOLDERS: tuple[WrittenFolder, ...] = (
         ),
     ),
     WrittenFolder(
-        "masks/released/, masks/released-raindrop/",
+        "masks/released/, masks/released-raindrop/, masks/released-fence/, masks/released-all/",
         "examples/release_model.py",
         "A released model: network and plate; `reconstruct` takes the first where none is named.",
         (

@@ -11,11 +11,11 @@ import numpy as np
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
 from doedesign.runs.folder import CAPTURE_TABLES, CONTINUOUS, HEIGHT, LEVEL_MAP, Run, open_run, spec_with
-from doedesign.runs.orders import order_of_run, require_order_of
+from doedesign.runs.orders import own_order, require_order_of
 from doedesign.spec import HEIGHT_FILES
 from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, sha256_file
+from fab.files import sha256_file
 from fab.grid import Grid
 from fab.height import HeightMap, outline_on, read_height
 from fab.layout.geometry import pixel_edges
@@ -113,9 +113,11 @@ def open_design(
         return source
     run = source if isinstance(source, Run) else open_run(Path(source))
     level_map = level_map_of_run(run, levels)
-    folder = Path(masks) if masks else order_of_run(run.spec.name, run.folder, level_map)
+    folder = Path(masks) if masks else None
+    if masks is None and levels is None:
+        folder = own_order(run.spec.name, run.folder, level_map)
     moves_m = run.spec.wafer.edge_moves_m if levels is None else ()
-    if levels is None and masks is not False and (masks or (folder / MANIFEST_NAME).is_file()):
+    if levels is None and folder is not None:
         level_map = level_map.with_level(drawn_in_masks(folder, level_map))
         moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
     continuous, aim = run.path(CONTINUOUS), None

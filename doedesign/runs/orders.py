@@ -1,5 +1,6 @@
 """Whose mask order a folder holds: where that of a run is looked for, and what may be replaced."""
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from math import isclose
@@ -14,6 +15,7 @@ from fab.manifest.records import Manifest, read_manifest
 from fab.units import format_length
 
 MASKS = Path("masks")
+_log = logging.getLogger("doedesign")
 _SHOWN = 12  # characters of a digest
 # By what the source of an order is known, whatever was drawn of it.
 _DIGESTS = ("level_map_sha256", "height_sha256")
@@ -35,6 +37,27 @@ def order_of_run(name: str, folder: Path | None, level_map: LevelMap | None, hom
     there = [place for place in places if (place / MANIFEST_NAME).is_file() and not _is_same(place, folder)]
     own = (place for place in there if level_map is None or is_order_of(place, level_map))
     return next(own, None) or next(iter(there), places[0])
+
+
+def own_order(name: str, folder: Path | None, level_map: LevelMap) -> Path | None:
+    """Folder of the mask order of a run where none is named, if there is one; that of another design is left aside.
+
+    Args:
+        name: name of its design.
+        folder: the run folder, if there is one.
+        level_map: its level map.
+
+    Raises:
+        InputError: a manifest that cannot be read.
+    """
+    place = order_of_run(name, folder, level_map)
+    if not (place / MANIFEST_NAME).is_file():
+        return None
+    read_manifest(place)  # damage is told
+    if is_order_of(place, level_map):
+        return place
+    _log.info("%s holds the masks of another design, or others than those of this run: they are left aside", place)
+    return None
 
 
 def place_of_order(level_map: LevelMap, origin: Mapping[str, Any], run: Path | None = None) -> Path:

@@ -15,14 +15,14 @@ from doedesign.design.metrics import design_metrics
 from doedesign.runs.curve_tables import encircled_csv, mtf_csv
 from doedesign.runs.folder import CONTINUOUS, Run, open_run
 from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
-from doedesign.runs.orders import order_of_run
+from doedesign.runs.orders import own_order
 from doedesign.runs.results import results_folder
 from doedesign.runs.verdict import certified_orders, verdict_in_words, with_verdict
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed
 from fab.figure import drawn_beside
-from fab.files import MANIFEST_NAME, canonical_json
+from fab.files import canonical_json
 from fab.height import HeightMap
 from fab.plots.height import plot_height
 from fab.runsheet.tables import CertifiedOrder
@@ -100,9 +100,9 @@ def _heights_of(run: Run, masks: str | Path | None) -> dict[str, np.ndarray]:
     # A training that left the DOE as it was has only the heights after rounding.
     before = {"continuous": read_any_height(file).height_m} if file.is_file() else {}
     designs = {**before, "quantised": level_map.height_m}
-    folder = order_of_run(run.spec.name, run.folder, level_map) if masks is None else Path(masks)
-    if masks is None and not (folder / MANIFEST_NAME).is_file():
-        log.info(f"no mask order in {folder}; write one with: doedesign masks {run.folder}")
+    folder = own_order(run.spec.name, run.folder, level_map) if masks is None else Path(masks)
+    if folder is None:
+        log.info(f"no mask order of this run; write one with: doedesign masks {run.folder}")
         return designs
     rebuilt = level_map.with_level(drawn_in_masks(folder, level_map))
     different = rebuilt.level != level_map.level

@@ -60,7 +60,7 @@ def single_thread_settings() -> dict[str, str]:
 
 def default_workers(peak_bytes: int) -> int:
     """As many workers as there are cores and memory for, given the bytes that one item takes at its peak."""
-    return max(1, min(cores(), int(free_gib() / (_BASE_GIB + peak_bytes / _GIB))))
+    return max(1, int(min(cores(), free_gib() / (_BASE_GIB + peak_bytes / _GIB))))
 
 
 def free_gib() -> float:

@@ -99,11 +99,11 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
     """
     path = Path(path)
     raw = read_toml(path, *_FILES[Spec])
-    keys = [_override(raw, text) for text in overrides]
+    keys = [_override(raw, text) for text in ([overrides] if isinstance(overrides, str) else overrides)]
     tables = {field.alias for field in Spec.model_fields.values()}
     for name, value in values.items():
         keys.append(key := name.replace("__", ".") if "__" in name or name in tables else f"optimize.{name}")
-        _put(raw, key, value)
+        _put(raw, key, value.tolist() if hasattr(value, "tolist") else value)  # numbers and arrays of NumPy
     filled = with_left_out(with_mask(with_response(raw, path), path), str(path), keys)
     spec = _checked(Spec, filled, str(path), keys)
     spec._file = path  # pyright: ignore[reportAttributeAccessIssue]

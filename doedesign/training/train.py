@@ -5,7 +5,7 @@ A folder of a training (`doedesign.training.job`) has besides
     spec.toml           the spec with overrides and defaults; optional keys where they differ
     pictures.json       names of all pictures, trained on and held out, and their licence
     network.npz         the trained network (`doedesign.recon.weights`)
-    psf.exr             PSFs of the trained DOE at the depths of the spec and at infinity
+    psf.exr             PSFs of the trained DOE at the depths of the spec, in the middle of the far ones and at infinity
     level_map.npz, height.exr   the DOE as it is to be drawn; height_continuous.exr before rounding, if it was trained
     metrics.json        scores on held-out scenes
     tensorboard/        on request
@@ -27,7 +27,7 @@ from jaxtyping import Float
 
 from doedesign import __version__
 from doedesign.build import camera_from_spec
-from doedesign.capture.camera import depth_range_m
+from doedesign.capture.camera import depth_range_m, middle_depth_m
 from doedesign.capture.from_spec import (
     obstruction_from_spec,
     occlusion_from_spec,
@@ -340,13 +340,15 @@ class JointTraining(TrainingJob):
             trained = self._design_of(state) if learnt else replace(self.design, continuous_m=None)
             height = trained.nominal_height_m
             names += write_design(folder, trained)
-        depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
+        far_m = middle_depth_m(spec.scene.far_m)
+        depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, far_m, np.inf)))
         bank = psf(height, camera, depths, propagation=spec.propagation)
         write_bank(folder / BANK_NAME, bank, {"design": spec.name})
         found = self.evaluate(state, baselines=True)
         write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))
+        told = {**camera_facts(camera, near), "far_m": None if np.isinf(far_m) else far_m}
         about = {**self.settings, "steps": state.step, "pictures": self.pictures, "version": __version__}
-        write_network(folder / NETWORK_NAME, state.best, {**camera_facts(camera, near), **about})
+        write_network(folder / NETWORK_NAME, state.best, {**told, **about})
         for data in (self.data, self.held_out):
             if skips := data.pictures.skips():
                 _log.info("%s", skips)

@@ -7,11 +7,9 @@ The same sheet comes as a page to print and write on, and as JSON. What was writ
 import base64
 from collections.abc import Iterator, Mapping
 from math import degrees
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from fab.files import canonical_json, write_atomic
 from fab.layout.marks import BOXES, VERNIER_STEP_M
 from fab.layout.part import Photomask
 from fab.layout.structures import BAR_WIDTHS_UM, PAD_SIDES_UM
@@ -301,12 +299,3 @@ def run_sheet_page(content: Mapping[str, Any], json_name: str, pictures: Mapping
     """
     sources = {name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in pictures.items()}
     return html_page("runsheet.html", sheet=content, json_name=json_name, pictures=_NONE | sources)
-
-
-def write_run_sheet(folder: Path, sheet: RunSheet, pictures: Mapping[str, bytes] = _NO_PICTURES) -> tuple[str, str]:
-    """Write "<stem>_RUNSHEET.html" and ".json", with the pictures of `run_sheet_page`; return both names."""
-    names = tuple(f"{sheet.stem}_RUNSHEET.{suffix}" for suffix in ("html", "json"))
-    content = record(sheet)
-    write_atomic(folder / names[0], run_sheet_page(content, names[1], pictures))
-    write_atomic(folder / names[1], canonical_json(content))
-    return names[0], names[1]

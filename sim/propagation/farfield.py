@@ -191,7 +191,8 @@ def _visible(camera: Camera, field_rad: tuple[float, float]) -> Array | None:
     if not camera.in_angles or np.hypot(*(np.abs(chief) + half)) <= 1:
         return None
     y, x = (float(-sine) for sine in chief)
-    return jnp.asarray(circle_coverage(Grid((camera.window, camera.window), camera.pixel_m), 2.0, (y, x)))
+    with jax.ensure_compile_time_eval():  # the plan is kept, and the first to ask for it may be a trace
+        return jnp.asarray(circle_coverage(Grid((camera.window, camera.window), camera.pixel_m), 2.0, (y, x)))
 
 
 @lru_cache(maxsize=32)

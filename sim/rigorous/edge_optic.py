@@ -74,7 +74,7 @@ class EdgeOptic(ViewedOptic):
         return self.from_afar(self.wavelengths_m)
 
     def with_camera(self, camera: Camera) -> "EdgeOptic":
-        """The same DOE before another lens or sensor; a ValueError for another aperture or substrate."""
+        """The same DOE before another lens or sensor; a ValueError for another aperture, substrate or kind of light."""
         own = super().with_camera(replace(camera, grid=self.drawn.grid)).camera
         drawn = replace(own, grid=self.drawn.grid)
         return self if drawn == self.drawn else replace(self, drawn=drawn)._prepared(self.height_m, self.depths_m)

@@ -106,7 +106,10 @@ def as_fabricated(
     Raises:
         InputError: an edge moves by half a cell or more through line-width bias, corners are rounded by more than
             half a cell, a mask is shifted by more than 8 cells, or an error has the wrong number of masks.
+        ValueError: a level map of another shape than the grid.
     """
+    if level_map.shape != camera.grid.shape:
+        raise ValueError(f"`level_map` must have the grid's shape {camera.grid.shape}, but got {level_map.shape}")
     levels = process.levels
     lines = wavelengths_m or tuple(dict.fromkeys(w for c in camera.colours for w in c.wavelengths_m))
     traced = is_traced(variation)
@@ -160,10 +163,11 @@ def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
     """A height that no wall exceeds by much; errors of usual size have it in common, and what is made for it."""
     none = (0,) * process.masks
     drawn = [depth * (1 + n) for depth, n in zip(process.depths_m(), variation.repeats or none, strict=True)]
+    usual = sum(drawn) or sum(process.depths_m())  # where every etch was missed there are no walls
     scales = none if traced else variation.depth_scale or none
     common = 0.0 if traced else variation.common_depth_scale
     made = sum(abs(depth * (1 + common) * (1 + scale)) for depth, scale in zip(drawn, scales, strict=True))
-    return HEADROOM * sum(drawn) * max(1, int(np.ceil(made / sum(drawn) / HEADROOM)))
+    return HEADROOM * usual * max(1, int(np.ceil(made / usual / HEADROOM)))
 
 
 def _walled(optic: EdgeOptic, wavelengths_m: tuple[float, ...]) -> FabricatedDoe:

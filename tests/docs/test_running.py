@@ -66,7 +66,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     made = tmp_path / "documentation"
     made.mkdir()
     shutil.copytree(ROOT / "examples", made / "examples")
-    for name in ("released", "released-raindrop"):
+    for name in ("released", "released-raindrop", "released-fence"):
         shutil.copytree(ROOT / "masks" / name, made / "masks" / name)
     for number, name in enumerate(("chelsea", "astronaut", "coffee", "rocket")):
         picture = getattr(data, name)()

@@ -15,6 +15,7 @@ import pytest
 from doedesign import __version__
 from doedesign.cli import app, exit_code, main
 from fab.errors import CheckFailed, InputError
+from tests.doedesign.small_runs import call
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = tuple(name for name in app if not name.startswith("-"))
@@ -83,6 +84,37 @@ def test_usage_mistakes(arguments: list[str], words: str, capsys: pytest.Capture
     assert words in printed.err
     command = f"doedesign {arguments[0]}" if arguments[0] in COMMANDS else "doedesign"
     assert printed.err.splitlines()[1:] == [f"Try: {command} --help"]
+
+
+def test_a_path_with_the_name_of_an_option_is_told_as_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for command in ("psf", "report"):
+        code, _, said = call(command, "masks")
+        assert code == 2
+        assert said.startswith("doedesign: masks: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", [">&-", "2>&-"])
+def test_closed_streams_are_nothing_to_stumble_over(tmp_path: Path, closed: str):
+    command = f"'{sys.executable}' -m doedesign.cli runs '{tmp_path}' {closed}"
+    done = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, check=False, env=os.environ)
+    assert done.returncode == 0
+    assert b"Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (("psf", "run", "--draw", "normal/3"), "--draw: must be given with --seed"),
+        (("simulate", "run", "--draw", "normal/3"), "--draw: must be given with --plate-seed"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(command: tuple[str, ...], words: str):
+    code, _, said = call(*command)
+    assert code == 2
+    assert words in said
 
 
 def failing(error: BaseException):

@@ -131,10 +131,12 @@ def test_the_order_of_a_height_map_may_be_drawn_again_and_is_told_by_its_file(pl
 @pytest.mark.usefixtures("work")
 def test_commands_find_the_order_of_a_run_by_the_name_of_its_folder(places: list[Path]):
     run, own = Path("runs") / "coarse", level_map_in("coarse")
+    # Nobody asked for that of the other run, which is left aside; who does is told.
+    assert open_design(run).level_map.digest == own.digest
     with pytest.raises(InputError, match="masks must be those of this run") as refused:
-        open_design(run)
+        open_design(run, "masks/small")
     assert refused.value.cure.endswith("a folder of their own: doedesign masks RUN.")
-    assert call("psf", run)[2].endswith("a folder of their own: doedesign masks RUN --out masks/OTHER.\n")
+    assert call("psf", run, "--masks", "masks/small")[2].endswith("their own: doedesign masks RUN --out masks/OTHER.\n")
     assert open_files(run).order is None
     code, _, said = call("show", run, "masks", "--print")
     assert code == 2

@@ -39,6 +39,15 @@ def written(folder: Path, *, state: str = "done", spec: str = SPEC, name: str = 
     return folder
 
 
+def with_metrics(folder: Path, metrics: object) -> Path:
+    """The run with other metrics, which its manifest knows of."""
+    (folder / "metrics.json").write_bytes(canonical_json(metrics))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["results_sha256"]["metrics.json"] = sha256_file(folder / "metrics.json")
+    (folder / "manifest.json").write_bytes(canonical_json(manifest))
+    return folder
+
+
 def numbers_of(folder: Path) -> dict[str, float | None]:
     return {one.key: one.value for one in main_numbers(folder, record_of(folder))}
 
@@ -71,6 +80,8 @@ def test_released_folders_are_found_and_whole():
         "example": ("order", "done"),
         "released": ("released model", "done"),
         "released-raindrop": ("released model", "done"),
+        "released-fence": ("released model", "done"),
+        "released-all": ("released model", "done"),
     }
     # Beside them lie orders of whoever drew some, such as `make demo`.
     assert {name: (one.kind, one.state) for name, one in found.items() if name in released} == released
@@ -167,7 +178,7 @@ def test_two_runs_side_by_side(tmp_path: Path):
     second = written(tmp_path / "b", order=0.2, spec=SPEC.replace('level_step = "300 nm"', 'level_step = "310 nm"'))
     metrics = json.loads((second / "metrics.json").read_text())
     metrics["psf"][1]["far_spot"] = 0.3
-    (second / "metrics.json").write_text(json.dumps(metrics))
+    with_metrics(second, metrics)
     found = compare_results([first, second])
     numbers = {one.key: one for one in found.numbers}
     assert numbers["far_spot"].best == 1
@@ -186,6 +197,15 @@ def test_a_table_that_one_spec_lacks_is_one_difference(tmp_path: Path):
     fewer = SPEC.replace('[[limit]]\nquantity = "strehl"\nmin = 0.9\n', "")
     found = compare_results([written(tmp_path / "a"), written(tmp_path / "b", spec=fewer)])
     assert [(one.key, one.values) for one in found.keys] == [("[limit[1]]", ("there", None))]
+
+
+def test_damaged_results_are_not_compared(tmp_path: Path):
+    first, second = (written(tmp_path / name) for name in "ab")
+    manifest = json.loads((second / "manifest.json").read_text())
+    manifest["results_sha256"] = {"metrics.json": "0" * 64}
+    (second / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=r"metrics\.json: must be the file that was written"):
+        compare_results([first, second])
 
 
 def test_what_cannot_be_compared_is_said(tmp_path: Path):
@@ -304,9 +324,8 @@ def test_a_zeroth_order_that_is_a_spot_is_told_as_one(tmp_path: Path):
     orders = {"on_target": 0.912, "uniformity_error": 0.0002, "zeroth_order_efficiency": 0.036, "spots": [0.036]}
     folders = []
     for name, wanted in (("a", True), ("b", True), ("c", False)):
-        folders.append(written(tmp_path / name))
         record = {"orders": orders | {"zeroth_order_wanted": wanted}}
-        (folders[-1] / "metrics.json").write_text(json.dumps(record))
+        folders.append(with_metrics(written(tmp_path / name), record))
     said = "light on target 91.2 %, uniformity error 0.02 %, 0th order 3.6 %"
     assert closing_lines(folders[0])[0] == f"result: {said} (one of the spots)"
     assert closing_lines(folders[2])[0] == f"result: {said}"

@@ -99,6 +99,21 @@ def test_a_worst_plate_that_is_carried_on_keeps_its_errors(spec: Path) -> None:
     assert task.variations(1, task.worst_of(carried, 1))[-1] == task.variations(0, task.worst_of(begun, -1))[1]
 
 
+def test_the_worst_plate_is_that_of_the_highest_mean(spec: Path) -> None:
+    """Of six plates in twenty steps the first four are looked at seven times, the others six times."""
+    task, _, _ = task_of(spec)
+    task = task._replace(spec=load_spec(spec, ["robust.draws=6"]))
+    begun = task.initial_state(np.zeros((48, 48), np.uint8))
+    losses = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.1]) * [7, 7, 7, 7, 6, 6]
+    assert task.worst_of(begun._replace(losses=losses), 0).tolist() == [0, 5]
+
+
+def test_roughness_is_drawn_anew_in_every_round(spec: Path) -> None:
+    task, _, _ = task_of(spec)
+    seeds = [one.seed for round_ in range(3) for one in task.variations(round_, np.array([-1, -1]))]
+    assert len(set(seeds)) == len(seeds)
+
+
 @pytest.mark.parametrize("draws", [1, 2, 3, 4])
 def test_every_plate_counts_alike_in_the_mean(spec: Path, draws: int) -> None:
     task, _, _ = task_of(spec)

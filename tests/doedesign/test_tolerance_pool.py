@@ -318,6 +318,8 @@ def test_there_are_as_many_workers_as_cores_and_memory_allow(monkeypatch: pytest
     assert default_workers(2400**2 * BYTES_PER_CELL) == 1
     monkeypatch.setattr("doedesign.runtime.pool.free_gib", lambda: 0.1)
     assert default_workers(100 * BYTES_PER_CELL) == 1
+    monkeypatch.setattr("doedesign.runtime.pool.free_gib", lambda: float("inf"))  # where the system does not say
+    assert default_workers(100 * BYTES_PER_CELL) == cores
 
 
 def test_a_study_knows_a_round_aperture_by_its_diameter_as_ever(fakes: ModuleType):

@@ -189,3 +189,9 @@ def test_a_process_of_rare_events_alone_has_samples(process: Process):
     assert sources_of(bare) == ("defects",)
     assert corner_keys(bare) == one_at_a_time_keys(bare) == []
     assert plate(bare, "sobol/defects/2").particles == plate(bare, "sobol/b/2").particles
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "x", True])
+def test_a_wrong_seed_is_told_as_one(process: Process, seed: object):
+    with pytest.raises(InputError, match="seed: must be a whole number of 0 or more"):
+        plate(process, "normal/0", seed)  # pyright: ignore[reportArgumentType]

@@ -1,5 +1,6 @@
 """Directions of light without a lens: a grating's orders and a square opening, against sums of their own."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,6 +69,12 @@ def test_a_square_opening_has_a_sinc_squared_in_the_sine():
     # The first dark place of 80 um at 532 nm is 0.381 degrees away.
     dark = np.degrees(np.arcsin((np.argmin(image[20, 20:32])) * camera.pixel_m))
     assert dark == pytest.approx(np.degrees(np.arcsin(WAVELENGTH / 80e-6)), abs=0.026)
+
+
+def test_a_plan_that_was_made_in_a_trace_serves_later_ones():
+    camera, flat = camera_of(32, 2 / 32), jnp.zeros((CELLS, CELLS), jnp.float32)
+    traced = jax.jit(lambda height: psf(height, camera).energy)(flat)
+    np.testing.assert_allclose(traced, psf(flat, camera).energy, rtol=1e-4, atol=1e-6)  # single precision
 
 
 @pytest.mark.slow

@@ -251,6 +251,14 @@ def test_the_error_of_a_line_is_the_mean_over_all_lines(aperture: Aperture):
     assert error == pytest.approx(np.sqrt((squares * lengths).sum() / lengths.sum()), rel=0.1)
 
 
+def test_a_camera_for_another_kind_of_light_is_refused():
+    seen = camera(16, 16, 1e-3)
+    edges = replace(seen, light="edges")
+    for optic, other in ((HeightOptic.of(seen), edges), (with_edges(levels(16), edges), seen)):
+        with pytest.raises(ValueError, match=r"substrate and light, .* (scalar|edges) light, but got"):
+            psf(optic, other)
+
+
 def test_what_cannot_be_is_refused():
     lens = camera(32, 32, 1e-3)
     for key, value in (("polarisation", "round"), ("light", "bright")):
@@ -274,7 +282,7 @@ def test_other_depths_and_cameras_are_prepared_for():
         found.energy, psf(with_edges(levels(32), other, depths_m=(0.1, 1.0)), depths=0.5).energy
     )
     assert optic.with_camera(lens) is optic
-    with pytest.raises(ValueError, match="`camera` must have the DOE's aperture and substrate"):
+    with pytest.raises(ValueError, match="`camera` must have the DOE's aperture, substrate and light"):
         optic.with_camera(replace(lens, aperture=1e-6))
 
 

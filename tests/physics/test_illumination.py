@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,7 +12,8 @@ from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.illumination import GaussianBeam, MeasuredBeam
 from sim.metrics import energy_budget, zeroth_order
-from sim.optic import HeightOptic
+from sim.optic import HeightOptic, RingOptic
+from sim.propagation.hankel import ring_count
 from sim.psf_bank import psf
 from sim.surface import as_fabricated
 
@@ -167,3 +169,15 @@ def test_a_tilted_beam_lands_where_its_axis_goes():
     waves = 1e-6 * (np.sqrt(1.4607**2 - 0.05**2) - np.sqrt(1 - 0.05**2)) / WAVE
     assert tilted == pytest.approx(np.cos(np.pi * waves) ** 2, abs=2e-3)
     assert tilted != pytest.approx(straight, abs=1e-4)
+
+
+def test_a_beam_of_many_modes_has_all_its_power():
+    shares = GaussianBeam((WAIST, WAIST), m_squared=(60.0, 1.0)).shares
+    assert sum(shares) == pytest.approx(1, abs=1e-12)
+    with pytest.raises(ValueError, match="must be at least 1"):
+        GaussianBeam((WAIST, WAIST), m_squared=(0.9, 1.0))
+
+
+def test_rings_are_not_lit_by_a_beam():
+    with pytest.raises(ValueError, match="must be lit evenly for rings"):
+        psf(RingOptic(CAMERA, jnp.zeros(ring_count(CAMERA))))

@@ -181,6 +181,7 @@ def test_what_is_written(run: Path, images: Path, whole: Path):
     network, about = read_network(whole / "network.npz")
     assert network.layout == layout_of(load_spec(run / "spec.toml"), 1)
     assert (about["occlusion"], about["steps"], about["near_m"]) == ("paper", STEPS, [6e-3, 9e-3])
+    assert about["far_m"] == pytest.approx(0.6, rel=1e-12)
     bank = read_bank(whole / "psf.exr")
     assert bank.depths_m == (6e-3, 9e-3, 0.6, np.inf)
     assert bank.energy.shape == (1, 4, 33, 33)  # odd, so that a capture lies on its scene

@@ -15,6 +15,7 @@ from doedesign.reference.pages import grouped, pages, public_names
 from doedesign.spec import load_variation
 
 ROOT = Path(__file__).parents[2]
+KINDS = ("raindrop", "fence", "all")
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,8 @@ def test_tables_have_no_open_cells(texts: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "folder", ["masks/automotive-2400", "masks/dslr-2800", "masks/released", "masks/released-raindrop"]
+    "folder",
+    ["masks/automotive-2400", "masks/dslr-2800", "masks/released", *(f"masks/released-{kind}" for kind in KINDS)],
 )
 def test_files_of_released_folders_are_described(folder: str) -> None:
     entry = next(one for one in FOLDERS if f"{folder}/" in one.path)
@@ -102,7 +104,7 @@ def test_files_of_an_order_are_described() -> None:
         ("runs/quick", "runs/NAME/"),
         ("runs/quick/psf", "RUN/psf/"),
         ("masks/quick", "masks/NAME/"),
-        ("masks/released-raindrop", "masks/released/, masks/released-raindrop/"),
+        ("masks/released-raindrop", "masks/released/, " + ", ".join(f"masks/released-{kind}/" for kind in KINDS)),
         ("runs/quick/x", ""),
     ],
 )

@@ -214,9 +214,17 @@ def test_the_order_of_another_run_is_left_aside_and_refused_if_given(run: Path):
         gather(run, order)
 
 
+def test_no_other_file_is_replaced(run: Path):
+    spec = (run / "spec.toml").read_bytes()
+    with pytest.raises(InputError, match="a report must not replace another file"):
+        dd.write_report(run, out=run / "spec.toml")
+    assert (run / "spec.toml").read_bytes() == spec
+
+
 def test_same_inputs_same_bytes(run: Path, tmp_path: Path):
     first = dd.write_report(run, out=tmp_path / "a.html").read_bytes()
     assert dd.write_report(run, out=tmp_path / "b.html").read_bytes() == first
+    assert dd.write_report(run, out=tmp_path / "a.html").read_bytes() == first  # an earlier one is replaced
     code, said, _ = call("report", run, "--json")
     assert code == 0
     path = Path(json.loads(said)["paths"][0])

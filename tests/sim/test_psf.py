@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.reference import make_camera, relative_error, wrapped_map
+from fab.errors import InputError
 from sim.camera import Colour
 from sim.optic import HeightOptic
 from sim.propagation.farfield import FarField
@@ -60,6 +61,12 @@ def test_propagations_by_name():
     assert isinstance(HeightOptic.of(ONE).plan(ONE.lines[0], np.inf), FarField)
     fine = HeightOptic.of(make_camera(300, 0.15e-3, 1e-3, 1e-6, 16))
     assert isinstance(fine.plan(fine.lines[0], np.inf, "fresnel"), DirectPath)
+
+
+@pytest.mark.parametrize("depths", [[], 0.0, [-0.1], [0.1, np.nan]])
+def test_depths_are_positive(depths: list[float] | float):
+    with pytest.raises(InputError, match="depth"):
+        psf(HEIGHT, ONE, depths)
 
 
 def test_a_map_of_another_shape_is_refused():

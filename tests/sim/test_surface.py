@@ -243,6 +243,19 @@ def test_a_missed_etch_leaves_its_mask_out_and_a_doubled_one_counts_twice(level:
         np.testing.assert_allclose(np.asarray(surface.transmission), expected(height), atol=SAME_LIGHT)  # pyright: ignore[reportArgumentType]
 
 
+def test_a_plate_whose_only_etch_was_missed_has_no_walls():
+    camera = dataclasses.replace(CAMERA, light="edges")
+    drawn = np.random.default_rng(0).integers(0, 2, GRID.shape).astype(np.uint8)
+    made = as_fabricated(drawn, camera, Process(Levels(2, 500e-9)), Variation(repeats=(-1,)))
+    np.testing.assert_allclose(np.abs(made.transmission[0]), made.coverage, atol=SAME_LIGHT)
+
+
+@pytest.mark.parametrize("shape", [(CELLS // 2, CELLS // 2), (CELLS, CELLS + 1)])
+def test_a_level_map_of_another_shape_is_refused(shape: tuple[int, int]):
+    with pytest.raises(ValueError, match="must have the grid's shape"):
+        as_fabricated(np.zeros(shape, np.uint8), CAMERA, PROCESS, Variation(common_depth_scale=0.02))
+
+
 def test_uniformity_is_a_bowl_and_a_tilt_over_the_wafer(level: np.ndarray):
     die, radius = (12e-3, -31e-3), 40e-3
     wafer = Process(LEVELS, die_m=die, wafer_radius_m=radius)

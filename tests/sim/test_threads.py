@@ -48,6 +48,25 @@ def test_an_error_keeps_what_has_not_begun_from_beginning(monkeypatch: pytest.Mo
     assert len(begun) < 10  # the two threads took a few before the error was seen
 
 
+def test_an_error_beside_a_long_item_does_so_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NPROC", "2")
+    begun: list[int] = []
+    failed = threading.Event()
+
+    def work(item: int) -> None:
+        begun.append(item)
+        if item == 0:
+            assert failed.wait(60)
+        if item == 1:
+            threading.Timer(0.2, failed.set).start()
+            raise ValueError("the second one")
+
+    with pytest.raises(ValueError, match="the second one"):
+        for _ in at_once(work, range(30)):
+            pass
+    assert begun == [0, 1]
+
+
 @pytest.mark.parametrize(("told", "count"), [("1", 1), ("3", 3), ("64", 8)])
 def test_as_many_as_xla_was_told(monkeypatch: pytest.MonkeyPatch, told: str, count: int) -> None:
     monkeypatch.setenv("NPROC", told)

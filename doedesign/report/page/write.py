@@ -8,9 +8,12 @@ from doedesign.report.page.compare import compared
 from doedesign.report.page.files import work_state
 from doedesign.report.page.gather import gather
 from doedesign.report.page.render import render
-from fab.files import write_atomic
+from fab.errors import InputError
+from fab.files import read_bytes, write_atomic
 
 _EVERY_S = 2.0
+# By which a page is known as one, in its first bytes.
+_MARK, _HEAD = b'<meta name="generator" content="doedesign', 2000
 
 
 def write_report(
@@ -32,10 +35,13 @@ def write_report(
         the file.
 
     Raises:
-        InputError: something that is damaged, was changed, or does not belong to the run.
+        InputError: something that is damaged, was changed, or does not belong to the run; `out` is another file than an
+            earlier page.
     """
     folder = Path(run)
     path = Path(out) if out is not None else folder / ("comparison.html" if compare else "report.html")
+    if path.is_file() and _MARK not in read_bytes(path)[:_HEAD]:
+        raise InputError(str(path), "a report must not replace another file", "no report", "Choose another place.")
     given = None if order is None else Path(order)
     content = compared([folder, *map(Path, compare)]) if compare else gather(folder, given)
     write_atomic(path, render(content))
