@@ -316,5 +316,7 @@ def _require_options(function: Objective, options: Mapping[str, Any], where: str
     try:
         signature.bind(None, **options)
     except TypeError as error:
-        rule, got = f"must be options of {function.__name__}{signature}", str(error).removeprefix("got ")
+        names = [name for name in signature.parameters][1:]
+        known = ", ".join(names) or "it has none"
+        rule, got = f"must be options of {function.__name__} ({known})", str(error).removeprefix("got ")
         raise InputError(f"{where}: options", rule, got, "Correct or remove the option.") from error

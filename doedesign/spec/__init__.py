@@ -58,6 +58,7 @@ from fab.errors import InputError
 from fab.files import MANIFEST_NAME, read_bytes
 from fab.levels import Levels
 from fab.process import Variation
+from fab.stock import IDEAL, STOCK
 
 _OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+|\[\d+\])*)\s*=(.*)", re.DOTALL)
 
@@ -119,7 +120,14 @@ def load_process(path: str | Path, levels: Levels | None = None) -> ProcessSpec:
     """Read a process from the `[process]` table of a TOML file; other tables of a spec are passed over.
 
     What the table leaves out of `levels`, `level_step` and `etch_depths` is that of a staircase, if one is given.
+
+    Raises:
+        InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
+    if not Path(path).suffix and not Path(path).exists():
+        names = ", ".join((*STOCK, IDEAL.name))
+        rule = "must be a file with a [process] table or the name of a process"
+        raise InputError(str(path), rule, "neither", f"Names are {names}.")
     return _load(ProcessFile, path, "process", {} if levels is None else {"process": _staircase(levels)}).process
 
 

@@ -243,6 +243,7 @@ def study(
         rule = "must be a function at the top of a module, for a study on disk is known by its name"
         raise InputError("evaluate", rule, evaluate.__qualname__, "Move it there.")
     given = limits if limits is not None else design.spec.limits if design.spec else ()
+    given = [given] if isinstance(given, str) else given
     obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in given)
     journal = Journal(None if out is None else Path(out), _identity(design, made, seed, evaluate), DrawLines())
     run = _runner(design, workers, scheduler, out is None)
