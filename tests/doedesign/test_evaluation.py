@@ -448,7 +448,7 @@ def test_networks_are_trained_scored_and_kept(run: Path, tmp_path: Path):
     assert by_name["proposed"]["paper"]["psnr"] == TABLE_2["dirt"]["proposed"].psnr
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_trainings_side_by_side_are_those_one_after_the_other(run: Path, tmp_path: Path, capfd: Any):
     """By processes of one thread each: the same networks but for the order of sums; the second waits for its plate."""
     trainings, networks = [TRAININGS[name] for name in ("proposed", "plain_unet")], []
