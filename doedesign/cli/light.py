@@ -10,8 +10,6 @@ from doedesign.cli.console import print_paths, print_results
 from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
 
-FIRST_DRAW = "normal/0"
-
 
 def psf(
     run: Path,
@@ -54,8 +52,9 @@ def psf(
         from doedesign.runs.fabricated import fabricated as predict
 
         folder = run / "fabricated"
+        chosen = {} if draw is None else {"draw": draw}
         with measured(run, "psf") as taken:
-            predict(run, masks, process=process, variation=variation, seed=seed, draw=draw or FIRST_DRAW, out=folder)
+            predict(run, masks, process=process, variation=variation, seed=seed, out=folder, **chosen)
         print_results(folder, json_)
         say_closing(folder, run, taken)
         return
@@ -162,7 +161,8 @@ def simulate(
     design, plate = open_design(run, masks, overrides=set_), None
     if fabricated:
         made_by = design.process(process)
-        plate = PlateErrors(made_by, *design.plate_errors(made_by, variation, plate_seed, draw or FIRST_DRAW))
+        chosen = {} if draw is None else {"draw": draw}
+        plate = PlateErrors(made_by, *design.plate_errors(made_by, variation, plate_seed, **chosen))
     how = {"obstruction": obstruction, "occlusion": occlusion, "count": count, "seed": seed, "size": size, "png": png}
     folder = out or run / "simulated"
     with measured(run, "simulate", writes=folder) as taken:

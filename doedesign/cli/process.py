@@ -69,7 +69,7 @@ def tolerance(
 
     folder = out or run / "tolerance"
     settings |= {"draws": draws, "sensitivity": sensitivity, "corners": corners, "budget": budget}
-    settings |= {"sobol": 64 if sobol is None else sobol, "wanted": 0.9 if yield_ is None else yield_}
+    settings |= {name: value for name, value in (("sobol", sobol), ("wanted", yield_)) if value is not None}
     with measured(run, "tolerance", writes=folder) as taken:
         study(run, **settings, out=folder, workers=workers, scheduler=scheduler)
     print_results(folder, json_, results=str(folder / "results.json"))

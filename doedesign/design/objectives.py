@@ -316,7 +316,6 @@ def _require_options(function: Objective, options: Mapping[str, Any], where: str
     try:
         signature.bind(None, **options)
     except TypeError as error:
-        names = [name for name in signature.parameters][1:]
-        known = ", ".join(names) or "it has none"
+        known = ", ".join(list(signature.parameters)[1:]) or "it has none"
         rule, got = f"must be options of {function.__name__} ({known})", str(error).removeprefix("got ")
         raise InputError(f"{where}: options", rule, got, "Correct or remove the option.") from error

@@ -159,7 +159,7 @@ class RobustTask(NamedTuple):
         seed = [self.spec.optimize.seed, _SALT, round_, place // 2]
         rng = np.random.default_rng(seed)
         scores, roughness = rng.standard_normal(len(varying(self.process))), int(rng.integers(2**31))
-        return draw_at(self.process, *((scores, roughness) if place % 2 == 0 else (-scores, roughness + 1)))
+        return draw_at(self.process, scores if place % 2 == 0 else -scores, roughness + place % 2)
 
     def look(self, step: int) -> StepSources:
         """Sources of a step: those of other steps, or others about them."""

@@ -4,8 +4,8 @@
 
 A finished training of the design's own run (`RUN/trained`, or a released model) with the same seed, occlusion model and
 obstruction stands for "proposed". All are trained on the same pictures, with the steps, sizes and seeds of the
-design's spec. On a processor several are trained side by side, each by a process with one thread: a training leaves
-half of a second core idle, and more of a third.
+design's spec. On a processor several are trained side by side, each by a process with one thread: a training keeps
+little more than one core busy, however many there are.
 """
 
 import logging

@@ -84,9 +84,9 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
 
     Args:
         path: the file.
-        overrides: changes such as ``"process.levels=8"`` or ``"sensor.pitch=1.85 um"``: a dotted key (list entries
-            by their number, ``objective[0].weight`` or ``objective.0.weight``) and a TOML value; quotes round text may
-            be left out.
+        overrides: changes, or a single one, such as ``"process.levels=8"`` or ``"sensor.pitch=1.85 um"``: a dotted key
+            (list entries by their number, ``objective[0].weight`` or ``objective.0.weight``) and a TOML value; quotes
+            round text may be left out.
         values: further changes, as they read best in Python: a key of ``[optimize]`` (``steps=60``), one of another
             table with the table before it (``process__levels=8, sensor__pitch="1.85 um"``), or a whole table.
 

@@ -64,7 +64,7 @@ def test_an_error_beside_a_long_item_does_so_too(monkeypatch: pytest.MonkeyPatch
     with pytest.raises(ValueError, match="the second one"):
         for _ in at_once(work, range(30)):
             pass
-    assert begun == [0, 1]
+    assert sorted(begun) == [0, 1]  # side by side, so either may come first
 
 
 @pytest.mark.parametrize(("told", "count"), [("1", 1), ("3", 3), ("64", 8)])

@@ -9,7 +9,7 @@ from doedesign.report.page.files import work_state
 from doedesign.report.page.gather import gather
 from doedesign.report.page.render import render
 from fab.errors import InputError
-from fab.files import read_bytes, write_atomic
+from fab.files import os_errors_explained, write_atomic
 
 _EVERY_S = 2.0
 # By which a page is known as one, in its first bytes.
@@ -40,12 +40,17 @@ def write_report(
     """
     folder = Path(run)
     path = Path(out) if out is not None else folder / ("comparison.html" if compare else "report.html")
-    if path.is_file() and _MARK not in read_bytes(path)[:_HEAD]:
+    if path.is_file() and not _is_page(path):
         raise InputError(str(path), "a report must not replace another file", "no report", "Choose another place.")
     given = None if order is None else Path(order)
     content = compared([folder, *map(Path, compare)]) if compare else gather(folder, given)
     write_atomic(path, render(content))
     return path
+
+
+def _is_page(path: Path) -> bool:
+    with os_errors_explained(path), path.open("rb") as stream:
+        return _MARK in stream.read(_HEAD)
 
 
 def watch_report(
