@@ -151,7 +151,7 @@ def test_a_bench_that_cannot_be_is_refused():
         PsfBench(throughput=1.2)
     with pytest.raises(InputError, match="exposures over the shortest"):
         PsfBench(bracket=(0.5,))
-    with pytest.raises(InputError, match="at least one, and positive"):
+    with pytest.raises(InputError, match="must be positive, at least one"):
         bench_measurement(design, usual_process(design), Variation(), PAPER, (-1.0,))
     half = PAPER.scaled(0.5)
     assert (half.relay_m, half.mode_field_m) == (PAPER.relay_m / 2, PAPER.mode_field_m)

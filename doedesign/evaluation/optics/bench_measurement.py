@@ -221,8 +221,6 @@ def bench_measurement(
     if design.camera.distance_m is not None:
         rule, cure = "the bench's camera has a lens", "Choose a design with a focal length."
         raise InputError("bench", rule, design.camera.lens_text, cure)
-    if not depths_m or min(depths_m) <= 0:
-        raise InputError("depths", "must be at least one, and positive", depths_m, 'For example "10 cm" and "inf".')
     camera, rng = bench_camera(design, bench), np.random.default_rng(seed)
     plate = replace(design, camera=camera).fabricated(process, variation=errors, depths=depths_m)
     through = bench_throughput(plate, bench)
