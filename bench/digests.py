@@ -44,7 +44,7 @@ def session(folder: Path) -> None:
     ]
     for command in commands:
         done = subprocess.run(
-            [sys.executable, "-m", "doedesign.cli", *command], capture_output=True, text=True, check=False, cwd=ROOT
+            [sys.executable, "-m", "doedesign", *command], capture_output=True, text=True, check=False, cwd=ROOT
         )
         print(f"{done.returncode} doedesign {' '.join(command)}".replace(str(folder), "."), file=sys.stderr)
         if done.returncode:

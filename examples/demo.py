@@ -132,7 +132,7 @@ def optimised_beside(spec_path: Path, runs: Path) -> Iterator[Callable[[], None]
         keeps its checkpoints.
     """
     out = runs / load_spec(spec_path).name
-    command = [sys.executable, "-m", "doedesign.cli", "optimize", str(spec_path), "--out", str(out)]
+    command = [sys.executable, "-m", "doedesign", "optimize", str(spec_path), "--out", str(out)]
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "log").open("w") as log:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
         if hasattr(os, "setpriority"):

@@ -44,17 +44,14 @@ class Patch:
         """Return the pixels nearest to the patch, which must lie on the map."""
         (ny, nx), pitch_m = grid.shape, grid.pitch_m
         count = round(self.width_m / pitch_m) if abs(self.width_m) < math.inf else 0
-        half_y_m, half_x_m = (extent / 2 * (1 + 1e-9) for extent in grid.extent_m)
-        if not (count >= 1 and abs(self.x_m) <= half_x_m and abs(self.y_m) <= half_y_m):
-            rule = (
-                f"must lie on the map, {format_length(2 * half_x_m)} x {format_length(2 * half_y_m)} about its middle"
-            )
+        middles = (self.y_m, ny), (self.x_m, nx)
+        row, column = (round(at / pitch_m + (n - count) / 2) if abs(at) < math.inf else -1 for at, n in middles)
+        if not (count >= 1 and 0 <= row <= ny - count and 0 <= column <= nx - count):
+            height, width = (format_length(extent) for extent in grid.extent_m)
+            rule = f"must lie on the map, {width} x {height} about its middle"
             got = f"{format_length(self.width_m)} about {format_length(self.x_m)}, {format_length(self.y_m)}"
             raise InputError("patch", rule, got, 'Give its middle and its edge, such as "0 um, 100 um, 50 um".')
-        row, column = (round(at / pitch_m + (n - count) / 2) for at, n in ((self.y_m, ny), (self.x_m, nx)))
-        window = PixelWindow(row, column, count, count)
-        window.require(grid)
-        return window
+        return PixelWindow(row, column, count, count)
 
     def require(self, level_map: LevelMap) -> None:
         """Check that a mesh, and if wanted a STEP file, of the patch stay small enough to be opened."""
@@ -74,7 +71,7 @@ def _tops(level_map: LevelMap, window: PixelWindow) -> dict[int, NDArray[np.int3
     count = sum(len(found) for found in tops.values())
     if count > _MOST_BOXES:
         rule = f"a STEP patch may have at most {_MOST_BOXES} boxes (a file of about 7 kB each)"
-        cure = "Choose a smaller window, or take the mesh alone."
+        cure = "Choose a shorter edge, or take the mesh alone."
         raise InputError("patch", rule, f"{count} in {window.rows} x {window.columns} pixels", cure)
     return tops
 

@@ -1,5 +1,6 @@
 """The command line itself: help, options, where things are printed, exit codes. The work has tests of its own."""
 
+import builtins
 import io
 import json
 import logging
@@ -8,10 +9,12 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from doedesign import __main__ as loading
 from doedesign import __version__
 from doedesign.cli import app, exit_code, main
 from fab.errors import CheckFailed, InputError
@@ -98,7 +101,7 @@ def test_a_path_with_the_name_of_an_option_is_told_as_a_path(tmp_path: Path, mon
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [">&-", "2>&-"])
 def test_closed_streams_are_nothing_to_stumble_over(tmp_path: Path, closed: str):
-    command = f"'{sys.executable}' -m doedesign.cli runs '{tmp_path}' {closed}"
+    command = f"'{sys.executable}' -m doedesign runs '{tmp_path}' {closed}"
     done = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, check=False, env=os.environ)
     assert done.returncode == 0
     assert b"Traceback" not in done.stderr
@@ -115,6 +118,21 @@ def test_options_that_would_do_nothing_are_refused(command: tuple[str, ...], wor
     code, _, said = call(*command)
     assert code == 2
     assert words in said
+
+
+def test_an_interrupt_before_the_commands_are_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    load = builtins.__import__
+
+    def interrupted(name: str, *arguments: Any, **more: Any) -> Any:
+        if name == "doedesign.cli":
+            raise KeyboardInterrupt
+        return load(name, *arguments, **more)
+
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    assert loading.main() == 130
+    assert capsys.readouterr().err == "doedesign: interrupted before anything was done\n"
 
 
 def failing(error: BaseException):
@@ -218,7 +236,7 @@ def test_stdout_that_takes_nothing(plate: Path, tmp_path: Path, target: str, cod
         pytest.skip(f"no {target} on this system")
     else:
         stdout = os.open(target, os.O_WRONLY)
-    command = [sys.executable, "-m", "doedesign.cli", *draw(plate, tmp_path / "order")]
+    command = [sys.executable, "-m", "doedesign", *draw(plate, tmp_path / "order")]
     done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False, cwd=ROOT)
     os.close(stdout)
     assert done.returncode == code
