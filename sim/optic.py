@@ -243,14 +243,15 @@ class HeightOptic(CellOptic):
         camera: lens, sensor and substrate.
         coverage: `[y, x]` open share of every cell.
         height_m: `[y, x]` DOE height, metres; None where `deviation` holds all.
-        deviation: `[line, y, x]` transmission of a DOE as fabricated over that of its heights, or None.
+        deviation: of every line, transmission `[y, x]` of a DOE as fabricated and its chrome over that of its heights,
+            or None. An array each: out of one for all, a compiled step would copy what it needs.
         source_kind: how sources are described; `SeparableSource` where a compiled step takes many of them.
     """
 
     camera: Camera = eqx.field(static=True)
     coverage: Float[Array, "y x"]
     height_m: Float[Array, "y x"] | None = None
-    deviation: Complex[Array, "line y x"] | None = None
+    deviation: tuple[Complex[Array, "y x"], ...] | None = None
     source_kind: type[SourceMap] | type[SeparableSource] = eqx.field(static=True, default=SourceMap)
 
     @classmethod
@@ -265,6 +266,11 @@ class HeightOptic(CellOptic):
     def cells(self, line: SpectralLine, source: CellSource | None = None) -> tuple[Array | None, Array | None]:
         """Heights, and what a DOE as fabricated does besides."""
         return self.height_m, None if self.deviation is None else self.deviation[self.lines.index(line)]
+
+    def rows(self, line: SpectralLine, source: CellSource) -> tuple[DoeRows, SourceColumns]:
+        """As of other DOEs; a deviation has the chrome already."""
+        rows, columns = super().rows(line, source)
+        return (rows if self.deviation is None else rows._replace(coverage=None)), columns
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -295,9 +301,8 @@ class HeightOptic(CellOptic):
         """The same for heights (metres) near these, with all that a DOE made of them does besides, seen from afar."""
         rates = [self.camera.waves_per_metre(line.wavelength_m) for line in self.lines]
         pairs = zip(self.lines, rates, strict=True)
-        deviation = [height_deviation(doe.at(line.wavelength_m), height_m, rate) for line, rate in pairs]
-        # The DOE's transmission has the chrome already.
-        return replace(self, deviation=jnp.stack(deviation), coverage=jnp.ones_like(self.coverage))
+        deviation = tuple(height_deviation(doe.at(line.wavelength_m), height_m, rate) for line, rate in pairs)
+        return replace(self, deviation=deviation)
 
     def raster(self, height_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
         """Heights of the cells."""

@@ -14,6 +14,7 @@ Sources: J. Jung et al., BOSON-1, arXiv:2411.08210 (worst cases in the loop); R.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +35,7 @@ from fab.levels import height_of
 from fab.process import Normal, Process, Variation
 from sim.optic import HeightOptic
 from sim.surface import as_fabricated
+from sim.threads import at_once
 
 # Steps that look at the same plates, after which the level map follows the phases: a plate's deviation is that of the
 # walls that it has. Measured on the quick example, two seeds: rounds of 40 end 0.02 to 0.05 higher, by too few plates.
@@ -179,7 +181,8 @@ class RobustTask(NamedTuple):
         cells = np.where(self.spec.doe.relief.inside(camera.grid), cells, parametrization.levels.count - 1)
         made = as_fabricated(cells.astype(np.uint8), camera, self.process, variation, whole_cells=True)
         assert isinstance(optic, HeightOptic)
-        return replace(self.problem, optic=optic.made_as(made, parametrization.drawn_height(cells)))
+        made_as = optic.made_as(made, parametrization.drawn_height(cells))
+        return replace(self.problem, optic=jax.block_until_ready(made_as))
 
     def steps(self, state: RobustState, done: int) -> Iterator[tuple[RobustState, dict[str, Any]]]:
         """Run the robust steps that are left.
@@ -201,9 +204,10 @@ class RobustTask(NamedTuple):
             round_, place = divmod(step, ROUND)
             if place == 0:
                 state = state._replace(worst=self.worst_of(state, round_ - 1), losses=np.zeros_like(state.losses))
+            level = state.level
             if not plates or place == 0:
-                plates = [self.plate(state.level, one) for one in self.variations(round_, state.worst)]
-            height = parametrization.drawn_height(state.level)
+                plates = list(at_once(partial(self.plate, level), self.variations(round_, state.worst)))
+            height = parametrization.drawn_height(level)
             look = self.look(self.spec.optimize.steps + step)
             seen, share = self.seen(place)
             found = [value_and_slope(plates[number], height, look) for number in seen]
@@ -215,7 +219,6 @@ class RobustTask(NamedTuple):
             slope = _weighted([gradient for _, _, gradient in found], share * weights)
             before = state.parameters, state.adam
             parameters, adam = moved_phases(optimiser, parametrization, before, slope, height)
-            level = state.level
             if place + 1 == ROUND or step + 1 == self.robust.steps:
                 wanted = parametrization.level(parametrization.continuous_m(parameters.radians))
                 level = self.rules.nearer(level, np.asarray(wanted).astype(np.uint8))

@@ -154,7 +154,7 @@ def _part(task, side, origin, frozen, active):  # pragma: no cover - compiled
     return moved
 
 
-def _sweep_all(task: RepairTask, weight: float, changed_too: bool) -> int:
+def _sweep_all(task: RepairTask, weight: float, changed_too: bool, sound: bool = False) -> int:
     """Sweep over stripes, first even and then odd ones: however many run at once, the result is the same."""
     end = task.etched.shape[0] - task.pad
     # A move at the edge of a stripe reads two narrowest widths of the next one and writes less than one.
@@ -166,7 +166,7 @@ def _sweep_all(task: RepairTask, weight: float, changed_too: bool) -> int:
     moved = 0
     with ThreadPoolExecutor() as pool:
         for half in (stripes[::2], stripes[1::2]):
-            moved += sum(pool.map(lambda rows: sweep(task, rows[0], rows[1], weight, changed_too), half))
+            moved += sum(pool.map(lambda rows: sweep(task, *rows, weight, changed_too, sound), half))
     return moved
 
 
@@ -308,5 +308,7 @@ def follow(
         opened = (np.arange(2**levels.bits)[:, None] >> bits) & 1
         wall = np.asarray(opened @ np.array(wall_costs), np.float64)
     task = _task_of(level_map, wanted, rules, _checked_waves(levels, waves_per_metre), wall)._replace(gravity=_GRAVITY)
-    _sweep_all(task, _HARD, changed_too=True)
+    # Where the rules ask for no width, touching corners break none of them, but count here.
+    sound = not any(plane.breaks or plane.kissing for plane in check(level_map, rules).planes)
+    _sweep_all(task, _HARD, changed_too=True, sound=sound)
     return _level_map_of(task, level_map)

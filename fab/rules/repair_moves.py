@@ -146,13 +146,39 @@ def _depths_near(task, y, x, reach, out):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _improve(task, y, x, weight):  # pragma: no cover - compiled
+def _filled_loss(task, y0, x0, y1, x1, depth, most):  # pragma: no cover - compiled
+    # `loss` of a rectangle if all of it had one depth, or any number that is not below `most` where that is not. For
+    # this nothing need be written: there are walls around the rectangle alone.
+    etched, wanted, wall, error = task.etched, task.wanted, task.wall, task.error
+    total = 0.0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            total += error[depth, wanted[y, x]]
+    if wall.size and total < most:
+        for y in range(y0, y1):
+            total += wall[depth ^ etched[y, x0 - 1]] + wall[depth ^ etched[y, x1]]
+        for x in range(x0, x1):
+            total += wall[depth ^ etched[y0 - 1, x]] + wall[depth ^ etched[y1, x]]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _filled_broken(task, y0, x0, y1, x1, depth):  # pragma: no cover - compiled
+    # `broken` of a rectangle if all of it had one depth.
+    kept = task.etched[y0:y1, x0:x1].copy()
+    task.etched[y0:y1, x0:x1] = depth
+    found = broken(task, y0, x0, y1, x1)
+    task.etched[y0:y1, x0:x1] = kept
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
     # Take the best of the moves that cover a pixel; tell whether there was one.
     etched = task.etched
     reach = max(task.line, task.space, 2)
     depths = np.empty(19, np.int64)
     many = _depths_near(task, y, x, reach, depths)
-    kept = np.empty((reach, reach), etched.dtype)
     best, best_depth = -1e-9, -1
     best_y = best_x = best_high = best_wide = 0
     # The pixel alone, and lines and a square with the pixel at one of their ends or corners.
@@ -166,24 +192,21 @@ def _improve(task, y, x, weight):  # pragma: no cover - compiled
         for v in range(max(y0, 0), min(y1, etched.shape[0])):
             for u in range(max(x0, 0), min(x1, etched.shape[1])):
                 allowed &= task.free[v, u]
-                kept[v - y0, u - x0] = etched[v, u]
         if not allowed:
             continue
-        before = weight * broken(task, y0, x0, y1, x1) + loss(task, y0, x0, y1, x1)
+        before = loss(task, y0, x0, y1, x1)
+        if not sound:
+            before += weight * broken(task, y0, x0, y1, x1)
+        if -before >= best:  # less than nothing cannot be lost
+            continue
         for i in range(many):
-            for v in range(y0, y1):
-                for u in range(x0, x1):
-                    etched[v, u] = depths[i]
-            change = loss(task, y0, x0, y1, x1) - before
+            change = _filled_loss(task, y0, x0, y1, x1, depths[i], before + best) - before
             # A move that costs more light than it can repair is not checked against the rules.
             if change < best:
-                change += weight * broken(task, y0, x0, y1, x1)
+                change += weight * _filled_broken(task, y0, x0, y1, x1, depths[i])
             if change < best:
                 best, best_depth = change, depths[i]
                 best_y, best_x, best_high, best_wide = y0, x0, high, wide
-        for v in range(y0, y1):
-            for u in range(x0, x1):
-                etched[v, u] = kept[v - y0, u - x0]
     if best_depth < 0:
         return False
     etched[best_y : best_y + best_high, best_x : best_x + best_wide] = best_depth
@@ -191,10 +214,12 @@ def _improve(task, y, x, weight):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def sweep(task, first, last, weight, changed_too):  # pragma: no cover - compiled
+def sweep(task, first, last, weight, changed_too, sound):  # pragma: no cover - compiled
     """Take the best move of every offending pixel of some rows; return how many were taken.
 
-    With `changed_too` also of every pixel that is not as wanted, and of those at a wall where walls cost something.
+    With `changed_too` also of every pixel that is not as wanted, and of those at a wall where walls cost something. A
+    map that breaks no rule is `sound`, and stays so if the weight of a broken rule is more than any light: nothing
+    offends, and no move has anything to repair.
     """
     etched = task.etched
     moved = 0
@@ -206,6 +231,6 @@ def sweep(task, first, last, weight, changed_too):  # pragma: no cover - compile
             seen = changed_too and own != task.wanted[y, x]
             if changed_too and task.wall.size and not seen:
                 seen = not own == etched[y, x - 1] == etched[y, x + 1] == etched[y - 1, x] == etched[y + 1, x]
-            if seen or offends(task, y, x):
-                moved += _improve(task, y, x, weight)
+            if seen or (not sound and offends(task, y, x)):
+                moved += _improve(task, y, x, weight, sound)
     return moved

@@ -198,8 +198,8 @@ def test_errors_of_a_process_and_the_perceptual_term() -> None:
     made = trainer(*PLAIN, *changes, perceptual=Distance(jnp.float32(3)))
     state = made.initial(heights())
     with_errors = [made._with_errors(state, step) for step in (0, 0, 1)]
-    learnt: list[Any] = [each.doe.learnt for each in with_errors]
-    errors = [np.asarray(one.deviation) for one in learnt]
+    optics: list[Any] = [each.doe.optic for each in with_errors]
+    errors = [np.stack(one.deviation) for one in optics]
     # Every step has errors of its own, which follow from its number.
     np.testing.assert_array_equal(errors[0], errors[1])
     assert np.mean(errors[0] != errors[2]) > 0.01
