@@ -187,6 +187,7 @@ def evaluate(
     run: Path,
     *,
     table: int = 2,
+    rows: Texts = (),
     figure: str | None = None,
     occlusion: str | None = None,
     obstruction: str | None = None,
@@ -217,6 +218,7 @@ def evaluate(
     Args:
         run: Run folder of a design, or the folder of a released model.
         table: 1, networks and deconvolution behind the plate; or 2, other cameras and single-image methods.
+        rows: Names of the rows to compute, such as proposed or conventional_network; all by default.
         figure: 4, PSFs and MTFs beside classic plates; 8, light against depth, as drawn and as fabricated; or bench,
             photographs of a plate on the paper's PSF bench, for calibrate.
         occlusion: radiometric, reciprocal, paper or paper_release; the spec's by default.
@@ -256,7 +258,7 @@ def evaluate(
     how |= {"pairs": pairs, "train": train, "seeds": seeds, "seed": seed, "border": "reflect" if reflect else "own"}
     how |= {"robust": robust, "process": process, "draws": draws, "methods": method, "lpips_weights": lpips_weights}
     with measured(run, "evaluate", writes=folder) as taken:
-        found = work(run, folder, table=table, overrides=set_, workers=workers, scheduler=scheduler, **how)
+        found = work(run, folder, table=table, rows=rows, overrides=set_, workers=workers, scheduler=scheduler, **how)
     log.info("%s", found.text())
     place = folder / found.folder_name
     print_results(place, json_, table=str(place / "table.csv"))

@@ -67,6 +67,7 @@ def evaluate(
     out: str | Path | None = None,
     *,
     table: int = 2,
+    rows: Sequence[str] = (),
     occlusion: str | None = None,
     obstruction: str | None = None,
     pairs: int = PAIRS,
@@ -92,6 +93,7 @@ def evaluate(
         source: run folder of the design, or the folder of a released model.
         out: folder of everything; RUN/evaluation if None.
         table: 1 (networks and deconvolution behind a plate) or 2 (against other cameras and single-image methods).
+        rows: names of the rows to compute, as in the table's files; all of them if empty.
         occlusion: occlusion model (`sim.imaging.occlusion`); that of the spec if None.
         obstruction: kind, or folder of masks; that of the spec if None.
         pairs: number of test pairs.
@@ -131,8 +133,8 @@ def evaluate(
         asked = PairSet.of(design.spec, str(run / "spec.toml"), picture_files(given.test), **how)
         own = design.spec.obstruction
         kind = obstruction or (own.kind if own else "")  # without either no pairs are made
-        rows = rows_of(table, kind, robust=robust is not None)
-        _require_names(programs, rows)
+        _require_names(programs, rows_of(table, kind, robust=robust is not None))
+        chosen = rows_of(table, kind, robust=robust is not None, names=rows)
         plan = TrainingPlan(
             run,
             folder,
@@ -145,12 +147,12 @@ def evaluate(
             robust=None if robust is None else Path(robust),
             lpips_weights=tuple(lpips_weights),
         )
-        needed = trainings_of(rows)
+        needed = trainings_of(chosen)
         if train:
             train_missing(plan, needed, seeds, workers)
         missing = lacking(plan, needed, seeds)
-        plates = plates_of(rows, plan, asked, seeds, missing, process, draws)
-        ready, left = candidates_of(rows, plan, seeds, missing, plates, asked.files)
+        plates = plates_of(chosen, plan, asked, seeds, missing, process, draws)
+        ready, left = candidates_of(chosen, plan, seeds, missing, plates, asked.files)
         study = _study(design, asked, kind, lpips)
         home = folder / folder_name(table, kind, asked.model.occlusion)
         journal, work, numbers = Journal(home, study, ScoreLines()), PairWork(asked, plates, ready, lpips), range(pairs)

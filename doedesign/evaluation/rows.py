@@ -185,17 +185,22 @@ def table_2(obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
     )
 
 
-def rows_of(table: int, obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
-    """Rows of Table 1 or 2; see `table_2`.
+def rows_of(
+    table: int, obstruction: str, *, robust: bool = False, names: Sequence[str] = ()
+) -> tuple[MethodRow, ...]:
+    """Rows of Table 1 or 2, or those of some names; see `table_2`.
 
     Raises:
-        InputError: another table.
+        InputError: another table, or a name that none of its rows has.
     """
-    if table == 1:
-        return TABLE_1
-    if table == 2:
-        return table_2(obstruction, robust=robust)
-    raise InputError("table", "must be 1 or 2, as in the paper", table, "Choose one of the two.")
+    if table not in (1, 2):
+        raise InputError("table", "must be 1 or 2, as in the paper", table, "Choose one of the two.")
+    rows = TABLE_1 if table == 1 else table_2(obstruction, robust=robust)
+    known = [row.name for row in rows]
+    for name in names:
+        if name not in known:
+            raise InputError("rows", f"must be among {', '.join(known)}", repr(name), "Choose among these.")
+    return tuple(row for row in rows if not names or row.name in names)
 
 
 def trainings_of(rows: Sequence[MethodRow]) -> tuple[Training, ...]:

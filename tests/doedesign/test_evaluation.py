@@ -426,6 +426,15 @@ def test_stopped_and_gone_on_with_it_ends_the_same(run: Path, tmp_path: Path, mo
         assert one.read_bytes() == other.read_bytes()
 
 
+def test_some_rows_alone_are_what_they_are_among_all(run: Path, tmp_path: Path):
+    """In any order; beside rows that were scored before, and without the row that others are compared to."""
+    names = ("conventional_capture", "telea")
+    some = evaluate(run, tmp_path / "out", pairs=2, rows=names[::-1], workers=0)
+    assert [one.row.name for one in some.rows] == list(names)
+    every = evaluate(run, tmp_path / "out", pairs=2, workers=0)
+    assert {one.row.name: one.scores for one in some.rows}.items() < {o.row.name: o.scores for o in every.rows}.items()
+
+
 def test_another_question_needs_another_folder(run: Path, tmp_path: Path):
     evaluate(run, tmp_path / "out", pairs=1, workers=0)
     with pytest.raises(InputError, match=r"one with another .*seed"):
@@ -521,6 +530,7 @@ def test_the_command_prints_where_the_table_is(run: Path, tmp_path: Path):
     for options, words in (
         (("--table", 3), "must be 1 or 2"),
         (("--pairs", 0), "must be at least 1"),
+        (("--rows", "proposed", "--rows", "mine"), "--rows: must be among proposed, "),
         (("--images", tmp_path), "--test"),
         (("--occlusion", "real"), "must be one of"),
         (("--method", "x"), "--method"),
