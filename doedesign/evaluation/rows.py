@@ -185,9 +185,7 @@ def table_2(obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
     )
 
 
-def rows_of(
-    table: int, obstruction: str, *, robust: bool = False, names: Sequence[str] = ()
-) -> tuple[MethodRow, ...]:
+def rows_of(table: int, obstruction: str, *, robust: bool = False, names: Sequence[str] = ()) -> tuple[MethodRow, ...]:
     """Rows of Table 1 or 2, or those of some names; see `table_2`.
 
     Raises:
