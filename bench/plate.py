@@ -44,7 +44,7 @@ def make_task(cells: int) -> tuple[Design, Process]:
     full = levels.count * levels.step_m
     height = np.mod(wrapped_map(cells, smooth_cells=4.0), full)
     level = quantise(height, levels)
-    level_map = LevelMap(level, levels, camera.grid, spec.doe.aperture_m, "bench")
+    level_map = LevelMap(level, levels, camera.grid, spec.doe.relief, "bench")
     design = Design(level_map, camera, spec.scene.near_m[:1], spec.scene.far_m[:1])
     return design, process_from_spec(spec.process)
 

@@ -92,8 +92,8 @@ def prysm_wavefronts(task: Task, shift_px: float = 0.0) -> tuple[Any, Any]:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # prysm reads its version through pkg_resources
-        from prysm.conf import config
-        from prysm.propagation import Wavefront
+        from prysm.conf import config  # pyright: ignore[reportMissingImports]
+        from prysm.propagation import Wavefront  # pyright: ignore[reportMissingImports]
     config.precision = 32
     camera = task.camera
     delay_nm = np.float32(camera.waves_per_metre(YELLOW_M) * YELLOW_M * 1e9)

@@ -5,6 +5,8 @@ positions themselves and the pixel integral is the midpoint rule, whose own erro
 thirty-two, a fourth).
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.ndimage import gaussian_filter
@@ -60,12 +62,10 @@ def oversampled_psf(
     positions = (camera.axis_m()[:, None] + offsets).ravel()
     if camera.fill == 1.0:
         edge = positions[-1] * pitch / scale
-        transform = ZoomFFT(cells, [-edge, edge], count, fs=1.0, endpoint=True)
+        transform: Any = ZoomFFT(cells, [-edge, edge], count, fs=1, endpoint=True)
     else:
         matrix = np.exp(-2j * np.pi / scale * np.outer(camera.grid.axis_m("x"), positions))
-
-        def transform(rows: np.ndarray) -> np.ndarray:
-            return rows @ matrix
+        transform = matrix.__rmatmul__  # rows @ matrix
 
     envelope = np.sinc(positions * pitch / scale)
     half = np.concatenate([transform(field[i : i + _BLOCK]) for i in range(0, cells, _BLOCK)]) * envelope

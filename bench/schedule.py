@@ -89,7 +89,7 @@ def seconds(course: Course) -> Iterator[float | Outcome]:
     problem, scene = problem_of(spec, {})
     first = initial_state(spec, problem, scene, {}, lambda path: np.load(path, allow_pickle=False)).parameters
 
-    update, state, taken = make_update(optimiser), (first, optimiser.init(first)), []
+    update, state, taken = make_update(optimiser), (first, optimiser.init(first)), []  # pyright: ignore[reportArgumentType]
     for step in range(spec.optimize.steps):
         start = time.perf_counter()
         state, loss, _ = update(step_inputs(spec, problem, scene, step), state)

@@ -182,10 +182,10 @@ def edges(path: Path) -> None:
                 axes.bar(places + (n - 1) * 0.28, 100 * orders, 0.28, color=hue, label=label)
             axes.set_title(words)
             axes.set_xlabel("order")
+            axes.set_ylabel("light (%)")
             axes.xaxis.get_major_locator().set_params(integer=True)
             axes.set_ylim(top=130 * max(found.scalar.max(), found.rigorous[0].max()))
             axes.legend()
-        figure.axes[0].set_ylabel("light (%)")
     save(figure, path)
 
 

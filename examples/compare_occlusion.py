@@ -92,7 +92,7 @@ def compare(
     light = np.zeros((1, 1, pixels), np.float32)
     light[..., list(lines)] = 1
     open_psf = optics.psf[0, 0]
-    bright = _on_lines([open_psf.sum(axis=0)] * len(lines), lines, pixels)[middle]
+    bright = _on_lines([np.asarray(open_psf.sum(axis=0))] * len(lines), lines, pixels)[middle]
     rows = []
     with meter("comparing", len(SHARES) * len(lines)) as progress:
         for n, share in enumerate(SHARES):

@@ -79,7 +79,7 @@ def judged(spec: Spec, levels: int, strategy: str, design: Design, seconds: floa
     def mean(name: str) -> float:
         return float(np.mean([row[name] for row in rows if name in row]))
 
-    numbers = float(losses(problem, view)[0]), mean("far_spot"), mean("concentration"), mean("zeroth_order")
+    numbers = float(losses(problem.terms, view)[0]), mean("far_spot"), mean("concentration"), mean("zeroth_order")
     return Outcome(levels, strategy, *numbers, edge_length_m(design) * 1e3, seconds)
 
 

@@ -63,7 +63,7 @@ def judge(design: Design, process: Process) -> Any:
 
     def look(errors: Variation) -> tuple[float, float, float, float]:
         found = predict(design, process, errors)
-        loss = float(losses(problem, all_of(found.bank.with_camera(design.camera), lens, near))[0])
+        loss = float(losses(problem.terms, all_of(found.bank.with_camera(design.camera), lens, near))[0])
         leaked = max(row["zeroth_order"] for row in found.rows)
         ratio = min(row["ring_to_disc"] for row in found.rows if "ring_to_disc" in row)
         spot = float(np.mean([row["far_spot"] for row in found.rows if "far_spot" in row]))

@@ -20,6 +20,7 @@
 # %%
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from PIL import Image
 from skimage import data
@@ -36,7 +37,7 @@ for name in template_names():
 
 
 # %%
-def designed(name: str, **changes: object) -> dd.Design:
+def designed(name: str, **changes: Any) -> dd.Design:
     """Design a template, with some keys of its spec changed."""
     with TemporaryDirectory() as folder:
         spec = Path(folder) / f"{name}.toml"

@@ -330,4 +330,4 @@ def relay_throughput(bench: Bench, plate: Plate) -> float:
     radius = camera.focal_length_m * tan(RELAY_RAD)
     wide = replace(camera, window=2 * ceil(radius / camera.pixel_m) + 2, colours=LINES[1:])
     psf = predict(replace(lifted(bench, plate.lift), camera=wide), bench.process, plate.variation).bank.energy[0, 0]
-    return energy_within(psf, camera.pixel_m, radius)
+    return float(energy_within(psf, camera.pixel_m, radius))

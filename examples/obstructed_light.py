@@ -74,8 +74,7 @@ class Rig:
         if 2 * self.cells > count:
             raise ValueError(f"`window` must be at least {2 * self.cells / _SAMPLES} pixels, but got {self.window}")
         columns = scipy.fft.fft(field * self.aperture, count, axis=1)
-        wave = scipy.fft.fft(columns, count, axis=0)
-        light = (wave.real**2 + wave.imag**2) * self._envelope
+        light = np.abs(np.asarray(scipy.fft.fft(columns, count, axis=0))) ** 2 * self._envelope
         return self._pixels @ light @ self._pixels.T / (self.aperture.sum() * count**2)
 
     @cached_property
@@ -163,7 +162,7 @@ def _spread(plane: np.ndarray, rig: Rig) -> Complex[np.ndarray, "y x"]:
         np.fft.fftfreq(count, rig.pitch_m).reshape(shape) ** 2
         for count, shape in zip(plane.shape, ((-1, 1), (1, -1)), strict=True)
     )
-    return scipy.fft.ifft2(spectrum * np.exp(-1j * np.pi * rig.wavelength_m * rig.depth_m * frequency))
+    return np.asarray(scipy.fft.ifft2(spectrum * np.exp(-1j * np.pi * rig.wavelength_m * rig.depth_m * frequency)))
 
 
 def picture(

@@ -159,13 +159,14 @@ def draw(path: Path, rows: list[Row]) -> None:
                 axes.plot(places, values, mark, color=hue, ms=4.5, mfc="none", mew=1.3, label=model)
             axes.set_yscale("log")
             axes.set_ylim(0.03, 200)
+            if scene == SCENES[-1]:
+                axes.legend(ncols=len(MODELS), loc="lower center")
             axes.set_title({"coarse": "coarse scene", "points": "bright points"}.get(scene, scene))
             axes.grid(True, axis="y")
             axes.set_xticks(places, [row.obstacle for row in rows])
             for plate in dict.fromkeys(row.plate for row in rows):
                 middle = np.mean([at for at, row in zip(places, rows, strict=True) if row.plate == plate])
                 axes.text(float(middle), 110, plate, ha="center", va="center", fontsize=SMALL)
-        figure.axes[-1].legend(ncols=len(MODELS), loc="lower center")
     save(figure, path)
 
 

@@ -127,7 +127,8 @@ def etched(design: Design, errors: WaferErrors) -> Raster:
         around = [plane[np.ix_(rows, columns)] for rows in near[0] for columns in near[1]]
         opened = np.logical_or.reduce(around) if moves[mask] > 0 else np.logical_and.reduce(around)
         depth[opened] += nominal * (1 + errors.deep[mask])
-    return Raster(*middles, *(np.diff(lines) for lines in axes), depth)
+    (y, x), (high, wide) = middles, (np.diff(lines) for lines in axes)
+    return Raster(y, x, high, wide, depth)
 
 
 class Bench(NamedTuple):

@@ -24,7 +24,7 @@ from doedesign.capture.camera import CaptureModel
 from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, rgb_from_channels, sensor_from_spec
 from doedesign.capture.images import Pictures, sample_files
 from doedesign.capture.scenes import SceneData
-from doedesign.capture.simulate import flat_psfs, photograph
+from doedesign.capture.simulate import Psfs, flat_psfs, photograph
 from doedesign.cli import exit_code
 from doedesign.recon.model import Model
 from doedesign.spec import load_spec
@@ -80,7 +80,7 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
     wanted = (side or load_spec(folder_of(model) / "spec.toml").train.size) + capture_model.margin_px
     view = CameraView((wanted, wanted), camera.pixel_m, camera.sensor_distance_m)
     sample = SceneData(Pictures((file,), most_px=2 * wanted), kind, view, far, seed, mirrored=False).item(0)
-    shot = photograph(sample, capture_model, model.bank.at, flat_psfs(camera), jax.random.key(seed))
+    shot = photograph(sample, capture_model, psfs_of(model), flat_psfs(camera), jax.random.key(seed))
     psfs = [shot.psf_far, shot.psf_near]
     clean, plain, plate = (
         np.clip(srgb_from_linear(image), 0, 1) for image in (shot.clean, shot.conventional, shot.doe)
@@ -119,6 +119,11 @@ def capture_model_of(
     name = occlusion_from_spec(spec, str(file), occlusion or model.about["occlusion"])
     made = replace(CaptureModel.make(camera, kind, name, sensor_from_spec(spec)), border="own")
     return made, kind, (min(spec.scene.far_m), max(spec.scene.far_m))
+
+
+def psfs_of(model: Model) -> Psfs:
+    """PSFs of a model's plate by the depth of a source, metres."""
+    return lambda depth_m: np.asarray(model.bank.at(depth_m))
 
 
 def restored(model: Model, capture: np.ndarray, far: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ from doedesign.hdr.study import CASES, LampRow, LampStudy
 from doedesign.runs.level_maps import open_design
 from fab.files import canonical_json, csv_table, write_atomic
 
-CAMERAS = ("plain lens", "plate")
+CAMERAS: tuple[str, ...] = ("plain lens", "plate")
 JUDGED = ("quick solver", "network")
 QUICK = LampSolver(rounds=4)
 PLATES = 10  # plates of a training

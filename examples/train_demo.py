@@ -167,7 +167,7 @@ def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[
     """
     models = {camera: Model.open(plan.out / f"{model}_{camera}_{seed}") for camera in CAMERAS}
     own, kind, far = see_through.capture_model_of(models["doe"])
-    psfs = [models[camera].bank.at for camera in CAMERAS]
+    psfs = {camera: see_through.psfs_of(models[camera]) for camera in CAMERAS}
     side = load_spec(plan.out / f"{model}_doe_{seed}" / "spec.toml").train.size + own.margin_px
     view = CameraView((side, side), own.camera.pixel_m, own.camera.sensor_distance_m)
     files = picture_files(source_of(plan).test)
@@ -178,10 +178,10 @@ def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[
             (name, scene), key = data.item(number), jax.random.key(number)
             turns = {"own": (scene, own), "reflect": (inner(scene, own.margin_px), replace(own, border="reflect"))}
             for border, (seen, by) in turns.items():
-                shot = photograph(NamedScene(name, seen), by, psfs[0], psfs[1], key)
+                shot = photograph(NamedScene(name, seen), by, psfs["doe"], psfs["conventional"], key)
                 for camera, light in zip(CAMERAS, (shot.doe, shot.conventional), strict=True):
-                    bank, depths = models[camera].bank, (shot.depth_far_m, shot.depth_near_m)
-                    network = see_through.restored(models[camera], light, *(bank.at(depth) for depth in depths))
+                    known = map(psfs[camera], (shot.depth_far_m, shot.depth_near_m))
+                    network = see_through.restored(models[camera], light, *known)
                     for what, image in (("capture", srgb_from_linear(light)), ("network", network)):
                         judged = scores(image[None], srgb_from_linear(shot.clean)[None], shot.mask[None])
                         found[border].setdefault(f"{camera}: {what}", []).append(float(judged.occluded.psnr[0]))

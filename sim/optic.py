@@ -241,15 +241,15 @@ class HeightOptic(CellOptic):
 
     Attributes:
         camera: lens, sensor and substrate.
-        coverage: `[y, x]` open share of every cell.
+        coverage: `[y, x]` open share of every cell; None where `deviation` has the chrome.
         height_m: `[y, x]` DOE height, metres; None where `deviation` holds all.
-        deviation: of every line, transmission `[y, x]` of a DOE as fabricated and its chrome over that of its heights,
-            or None. An array each: out of one for all, a compiled step would copy what it needs.
+        deviation: of every line, transmission `[y, x]` of a DOE as fabricated over that of its heights, or None. An
+            array each: out of one for all, a compiled step would copy what it needs.
         source_kind: how sources are described; `SeparableSource` where a compiled step takes many of them.
     """
 
     camera: Camera = eqx.field(static=True)
-    coverage: Float[Array, "y x"]
+    coverage: Float[Array, "y x"] | None
     height_m: Float[Array, "y x"] | None = None
     deviation: tuple[Complex[Array, "y x"], ...] | None = None
     source_kind: type[SourceMap] | type[SeparableSource] = eqx.field(static=True, default=SourceMap)
@@ -266,11 +266,6 @@ class HeightOptic(CellOptic):
     def cells(self, line: SpectralLine, source: CellSource | None = None) -> tuple[Array | None, Array | None]:
         """Heights, and what a DOE as fabricated does besides."""
         return self.height_m, None if self.deviation is None else self.deviation[self.lines.index(line)]
-
-    def rows(self, line: SpectralLine, source: CellSource) -> tuple[DoeRows, SourceColumns]:
-        """As of other DOEs; a deviation has the chrome already."""
-        rows, columns = super().rows(line, source)
-        return (rows if self.deviation is None else rows._replace(coverage=None)), columns
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -302,7 +297,8 @@ class HeightOptic(CellOptic):
         rates = [self.camera.waves_per_metre(line.wavelength_m) for line in self.lines]
         pairs = zip(self.lines, rates, strict=True)
         deviation = tuple(height_deviation(doe.at(line.wavelength_m), height_m, rate) for line, rate in pairs)
-        return replace(self, deviation=deviation)
+        # The DOE's transmission has the chrome already.
+        return replace(self, deviation=deviation, coverage=None)
 
     def raster(self, height_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
         """Heights of the cells."""

@@ -206,6 +206,7 @@ class RobustTask(NamedTuple):
                 state = state._replace(worst=self.worst_of(state, round_ - 1), losses=np.zeros_like(state.losses))
             level = state.level
             if not plates or place == 0:
+                plates = []  # before others take memory
                 plates = list(at_once(partial(self.plate, level), self.variations(round_, state.worst)))
             height = parametrization.drawn_height(level)
             look = self.look(self.spec.optimize.steps + step)

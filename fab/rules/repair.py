@@ -166,7 +166,7 @@ def _sweep_all(task: RepairTask, weight: float, changed_too: bool, sound: bool =
     moved = 0
     with ThreadPoolExecutor() as pool:
         for half in (stripes[::2], stripes[1::2]):
-            moved += sum(pool.map(lambda rows: sweep(task, *rows, weight, changed_too, sound), half))
+            moved += sum(pool.map(lambda rows: sweep(task, rows[0], rows[1], weight, changed_too, sound), half))
     return moved
 
 

@@ -102,5 +102,5 @@ def shadowed_psf(
         passed = shadow(camera, mask, depth_m, background_depth_m, line.wavelength_m, point, border)
         doe = cis(height * jnp.float32(camera.waves_per_metre(line.wavelength_m)))
         fields.append(jnp.asarray(passed, jnp.complex64) * doe)
-    optic = HeightOptic(camera, HeightOptic.of(camera).coverage, None, jnp.stack(fields))
+    optic = HeightOptic(camera, HeightOptic.of(camera).coverage, None, tuple(fields))
     return np.asarray(psf(optic, depths=background_depth_m).energy[:, 0])

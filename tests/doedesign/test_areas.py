@@ -330,6 +330,7 @@ def test_random_starts_are_for_any_beam(tmp_path: Path):
         camera = design.camera
         half = np.where(camera.grid.axis_m("x") < 0, 1.0, 0.0) * np.ones((128, 1))
         optic = design.as_optic()
+        assert optic.coverage is not None
         masked = replace(optic, coverage=optic.coverage * jnp.asarray(half, jnp.float32))
         image, axis = np.asarray(psf(masked).energy[0, 0]), camera.axis_m()
         inside = np.abs(axis[:, None]) < 80e-6

@@ -49,6 +49,7 @@ def test_what_is_drawn_follows_the_rule_and_the_mirror():
     outline /= outline.std()
     assert not np.array_equal(outline > 0, design_splitter.painted(outline > 0))
     cell = design_splitter.drawn(outline)
+    assert cell is not None
     assert np.array_equal(cell, design_splitter.painted(cell))
     assert np.array_equal(~cell, design_splitter.painted(~cell))
     assert np.array_equal(cell, np.roll(cell[:, ::-1], 1, 1))
