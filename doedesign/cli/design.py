@@ -208,9 +208,12 @@ def masks(
     from doedesign.runs.costs import measured
 
     if as_built is not None:
-        for option, given in (("--wafer", wafer), ("--terms", terms)):
+        fixed = {"--levels": levels, "--step": step, "--etch-depths": etch_depths, "--pitch": pitch, "--scale": scale}
+        fixed |= {"--aperture": aperture, "--wafer": wafer, "--terms": terms, "--probe": probe}
+        written = {"--out": out, "--patch": patch, "--mesh-patch": mesh_patch}
+        for option, given in (fixed | written).items():
             if given is not None:
-                cure = "Leave it out: the order has its own."
+                cure = "Leave it out: the order has its own." if option in fixed else "Leave it out."
                 raise InputError(option, "does not go with --as-built", given, cure)
         from doedesign.lab.as_built import as_built as predict
 
@@ -222,6 +225,9 @@ def masks(
         return
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
+    if probe is not None and not source.is_dir():
+        rule = "goes with a run, which says what light and what glass"
+        raise InputError("--probe", rule, f"{probe} for {source}", "Leave it out.")
     from doedesign.lab.order import PROBE_M, drawn_as, write_masks
     from fab.order.formats import Formats
 

@@ -235,8 +235,15 @@ def test_all_formats_are_named(cli, tmp_path):
     assert "must be one of .exr, .npy, .tif, .tiff, .png, but got .bmp" in done.err
 
 
-def test_a_wafer_is_no_part_of_what_was_built(cli, tmp_path):
-    (tmp_path / "lab.toml").write_text(FILE)
-    done = cli("masks", tmp_path, "--as-built", tmp_path / "a.json", "--wafer", tmp_path / "lab.toml")
+@pytest.mark.parametrize("option", ["--wafer", "--levels", "--out", "--probe"])
+def test_what_an_order_has_is_no_part_of_what_was_built(cli, tmp_path, option: str):
+    done = cli("masks", tmp_path, "--as-built", tmp_path / "a.json", option, 16)
     assert done.code == 2
-    assert "does not go with --as-built" in done.err
+    assert f"{option}: does not go with --as-built" in done.err
+
+
+def test_a_bare_map_has_no_light_for_a_laser(cli, tmp_path):
+    options = write_map(tmp_path / "a.npy", np.full((30, 30), 3 * STEP_M), "npy")
+    done = cli("masks", tmp_path / "a.npy", *options, "--probe", "633 nm")
+    assert done.code == 2
+    assert "--probe: goes with a run" in done.err
