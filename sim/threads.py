@@ -11,6 +11,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import TypeVar
 
 _MOST = 8  # each holds a field of its own
+_here = threading.local()  # `busy`: whether this thread is one of several that work side by side
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -25,8 +26,10 @@ def side_by_side() -> int:
     """How many computations run side by side: on a processor as many as it has cores, at most 8.
 
     Where the environment variable NPROC tells XLA how many threads to take, it is told here too. On another device two,
-    of which one is prepared by the host while the other is computed.
+    of which one is prepared by the host while the other is computed. One where this is asked by such a computation.
     """
+    if getattr(_here, "busy", False):
+        return 1
     import jax  # how many cores there are is asked by commands that need none of it
 
     if jax.default_backend() != "cpu":
@@ -50,6 +53,7 @@ def at_once(work: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterato
     def unless_failed(item: _Item) -> _Result:
         if failed.is_set():  # the error of an earlier item is raised before anybody asks for this one
             raise CancelledError
+        _here.busy = True  # the threads of the pool do nothing else
         try:
             return work(item)
         except BaseException:

@@ -146,12 +146,12 @@ def as_fabricated(
         rest = 1.0 - cell_share(variation.correlation_m / camera.grid.pitch_m)
         variance = rest * (2 * np.pi * waves * variation.roughness_m) ** 2
         left = (jnp if traced else np).exp(single(-0.5 * variance))
-    weights = [view_weights(camera, plan.parts, views, TILE, count) for count in camera.grid.shape]
+    along_y, along_x = (view_weights(camera, plan.parts, views, TILE, count) for count in camera.grid.shape)
     grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
     centre = stacked([single(variation.chrome_y_m), single(variation.chrome_x_m)])
     opening = Opening(coverage, centre, outline_of(camera.opening, variation.chrome_diameter_m))
-    transmission, means = transmission_of(plan, packed, widths, relief, rates, left, opening, *weights)
+    transmission, means = transmission_of(plan, (along_y, along_x), packed, widths, relief, rates, left, opening)
     found = FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
     if camera.light == "scalar":
         return found

@@ -15,30 +15,58 @@ from sim.surface.lines import LINE_DEGREES, line_moments
 from sim.surface.opening import Opening, through_opening
 from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
+from sim.threads import at_once
 from sim.tracing import compiled_quickly, in_jit, is_traced
 
+# Rows of tiles that are computed together. Where two such parts meet, light is summed in another order, so that as many
+# as there are cores would give other bytes on other machines.
+_ROWS = 8
 
-def transmission_of(plan: TilePlan, *arrays: Any) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
+
+def transmission_of(
+    plan: TilePlan, along: tuple[Any, Any], *arrays: Any
+) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     """Transmission of every cell, tile by tile, with the far field of plate and chrome in every view; means without.
 
-    The arrays, numpy's or jax's: etches of every cell, one bit each; widths of openings in cells, where etches lag;
-    `relief`; waves per metre of height of every wavelength; the amplitude that roughness finer than a cell leaves of
-    each; the chrome's `Opening`; and the `view_weights` along y and x.
+    Rows of tiles are computed side by side (`sim.threads`), except in a trace.
+
+    Args:
+        plan: what is compiled.
+        along: the `view_weights` along y and x, numpy's.
+        arrays: numpy's or jax's: etches of every cell, one bit each; widths of openings in cells, where etches lag;
+            `relief`; waves per metre of height of every wavelength; the amplitude that roughness finer than a cell
+            leaves of each; and the chrome's `Opening`.
     """
-    return (_compiled if is_traced(*arrays) or in_jit() else _compiled_quickly())(plan, *arrays)
+    (weights_y, weights_x), count = along, len(along[0])
+    if is_traced(*arrays) or in_jit():
+        return _compiled(plan, np.arange(count, dtype=np.int32), weights_y, weights_x, *arrays)
+    rows_of, plate_of = _compiled_quickly()
+    long = min(_ROWS, count)
+    numbers = np.arange(-(-count // long) * long, dtype=np.int32).reshape(-1, long)
+
+    def part(rows: np.ndarray) -> Any:
+        of_rows = np.where(rows < count, rows, -1), weights_y[np.minimum(rows, count - 1)]
+        return jax.block_until_ready(rows_of(plan, *of_rows, weights_x, *arrays))
+
+    return plate_of(plan, list(at_once(part, list(numbers))))
 
 
-def _transmission(
+def _rows_of_tiles(
     plan: TilePlan,
+    numbers: Int[Array, " strip"],
+    weights_y: Float[Array, "strip view part kind s wide"],
+    weights_x: Float[Array, "tile_x view part kind s wide"],
     etched: UInt8[Array, "y x"],
     widths: UInt8[Array, "mask y x"] | None,
     relief: EtchParameters,
     rates: Float[Array, " w"],
     left: Float[Array, " w"],
     opening: Opening,
-    weights_y: Float[Array, "tile_y view part kind s wide"],
-    weights_x: Float[Array, "tile_x view part kind s wide"],
-) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
+) -> tuple[Float[Array, "view 2 tall u"], Float[Array, "w 2 v u"]]:
+    """Rows of tiles that follow each other, -1 for none: their light, with what spills to either side, and means.
+
+    The axis with two places is real and imaginary part.
+    """
     reach = REACH if plan.cut else 0
     ny, nx = plan.grid.shape
     count_y, count_x = -(-ny // TILE), -(-nx // TILE)
@@ -66,10 +94,10 @@ def _transmission(
         return _tile_rows(moments, lines, along_x, plan), means * left[:, None, None, None]
 
     def lit_tile(*at: Array) -> tuple[Array, Array]:
-        """Nothing under the chrome, where a fifth of the tiles of a square around a circle lie."""
+        """Nothing under the chrome, where a fifth of the tiles of a square around a circle lie, and in no row."""
         size = TILE * plan.parts, TILE * plan.parts
         corner = at[0] * plan.parts, at[1] * plan.parts
-        lit = jnp.any(jax.lax.dynamic_slice(opening.coverage, corner, size) > 0)
+        lit = (at[0] >= 0) & jnp.any(jax.lax.dynamic_slice(opening.coverage, corner, size) > 0)
         dark = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), jax.eval_shape(tile, *at))
         return jax.lax.cond(lit, lambda: tile(*at), lambda: dark)
 
@@ -85,21 +113,40 @@ def _transmission(
             views.append(_strip_values(rows[v, np.array([0, *kinds + 1])], along_y[v][:, kinds]))
         return jnp.stack(views), _joined(means, 4, 0)
 
-    strips, means = jax.lax.map(lambda at: strip(*at), (jnp.arange(count_y) * TILE, weights_y))
+    strips, means = jax.lax.map(lambda at: strip(*at), (numbers * TILE, weights_y))
+    # Rows of nothing on either side take what spills.
+    none, size = jnp.zeros_like(strips[:1]), TILE * plan.parts
+    joined = _joined(jnp.concatenate([none, strips, none]), 3, reach)
+    return joined[:, :, size - reach : joined.shape[2] - size + reach], _joined(means, 3, 0)
+
+
+def _plate(
+    plan: TilePlan, parts: list[tuple[Float[Array, "view 2 tall wide"], Float[Array, "w 2 low wide"]]]
+) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
+    """All rows of tiles together, without what is beyond the plate."""
+    ny, nx = plan.grid.shape
     inside = (slice(None), slice(ny * plan.parts), slice(nx * plan.parts))
-    transmission, means = (
-        jax.lax.complex(part[:, 0], part[:, 1])[inside] for part in (_joined(strips, 3, reach), _joined(means, 3, 0))
-    )
-    return transmission, means
+
+    def whole(blocks: tuple[Array, ...], reach: int) -> Array:
+        joined = _joined(jnp.stack(blocks), 3, reach)
+        return jax.lax.complex(joined[:, 0], joined[:, 1])[inside]
+
+    light, means = zip(*parts, strict=True)
+    return whole(light, REACH if plan.cut else 0), whole(means, 0)
+
+
+def _transmission(plan: TilePlan, *arrays: Any) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
+    return _plate(plan, [_rows_of_tiles(plan, *arrays)])
 
 
 _compiled = jax.jit(_transmission, static_argnames=("plan",))
 
 
 @lru_cache(maxsize=1)
-def _compiled_quickly() -> Callable[..., Any]:
+def _compiled_quickly() -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The same to the last bit but one, which a trace cannot hold: as fast, and compiled in two thirds of the time."""
-    return jax.jit(_transmission, static_argnames=("plan",), compiler_options=compiled_quickly())
+    how: Any = {"static_argnames": ("plan",), "compiler_options": compiled_quickly()}
+    return jax.jit(_rows_of_tiles, **how), jax.jit(_plate, **how)
 
 
 def _tile_moments(

@@ -57,6 +57,19 @@ def level() -> np.ndarray:
     return np.pad(inner, 6, constant_values=15)
 
 
+def test_parts_of_a_plate_join_to_the_whole():
+    """Ten rows of tiles, in two parts; and all of them in one program, as in a trace."""
+    shape = (300, 40)
+    camera = dataclasses.replace(CAMERA, grid=Grid(shape, PITCH_M), aperture=1.2 * max(shape) * PITCH_M)
+    level = np.random.default_rng(4).integers(0, 16, shape).astype(np.uint8)
+    errors = Variation(overlay_y_m=(0.4e-6, -0.3e-6, 0.5e-6, 0.0), cd_bias_m=(0.1e-6, 0.0, 0.05e-6, -0.1e-6))
+    made = as_fabricated(level, camera, PROCESS, errors)
+    whole = jax.jit(lambda traced: as_fabricated(level, camera, PROCESS, traced).transmission)(errors)
+    assert made.transmission.shape == whole.shape == (2, *shape)
+    # Sums of single precision in another order.
+    np.testing.assert_allclose(made.transmission, whole, atol=2e-6)
+
+
 def expected(height_m: np.ndarray) -> np.ndarray:
     """Transmission of cells of these heights, float64."""
     rates = np.array([CAMERA.waves_per_metre(line) for line in LINES_M])

@@ -27,6 +27,12 @@ def test_results_come_in_order_whichever_is_ready_first(monkeypatch: pytest.Monk
     assert list(at_once(work, range(5))) == [0, 1, 4, 9, 16]
 
 
+def test_what_works_side_by_side_is_not_divided_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NPROC", "2")
+    assert list(at_once(lambda _: side_by_side(), range(4))) == [1, 1, 1, 1]
+    assert side_by_side() == 2
+
+
 def test_an_error_keeps_what_has_not_begun_from_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NPROC", "2")
     begun: list[int] = []
