@@ -55,7 +55,7 @@ def test_a_patch_is_written_on_request(finished, cli, tmp_path, option, names):
     [
         (["--patch", "0 um, 0 um"], "must be three lengths"),
         (["--patch", "0 um, 0 um, wide"], "must be a length with a unit"),
-        (["--patch", "0 um, 0 um, 1 mm"], "must be filled and lie on the 64 x 64 pixels"),
+        (["--patch", "0 um, 0 um, 1 mm"], "must lie on the map"),
         (["--patch", "0 um, 0 um, 9 um", "--mesh-patch", "0 um, 0 um, 9 um"], "does not go with --patch"),
     ],
 )
