@@ -41,7 +41,6 @@ def transmission_of(
     if is_traced(*arrays) or in_jit():
         return _compiled(plan, np.arange(count, dtype=np.int32), weights_y, weights_x, *arrays)
     rows_of, plate_of = _compiled_quickly()
-    weights_x, *arrays = jax.device_put((weights_x, *arrays))  # once, not for every part
     long = min(_ROWS, count)
     numbers = np.arange(-(-count // long) * long, dtype=np.int32).reshape(-1, long)
 
