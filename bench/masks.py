@@ -77,7 +77,7 @@ def timed(work: Callable[[], object]) -> float:
 
 def ratio(work: Callable[[], object], floor: Callable[[], object], pairs: int) -> tuple[float, float, float]:
     """Return the medians of work, of floor, and of their ratio, measured in turn after one unmeasured pair."""
-    _ = work(), floor()
+    work(), floor()
     times = [(timed(work), timed(floor)) for _ in range(pairs)]
     return (
         statistics.median(a for a, _ in times),

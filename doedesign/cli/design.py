@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -205,23 +206,12 @@ def masks(
         mesh_cells: Most columns of the mesh of the whole relief along x and y, up to 1000.
         overwrite: Where the folder has the order of another design, replace that order.
     """
-    from doedesign.runs.costs import measured
-
     if as_built is not None:
         fixed = {"--levels": levels, "--step": step, "--etch-depths": etch_depths, "--pitch": pitch, "--scale": scale}
         fixed |= {"--aperture": aperture, "--wafer": wafer, "--terms": terms, "--probe": probe}
-        written = {"--out": out, "--patch": patch, "--mesh-patch": mesh_patch}
-        for option, given in (fixed | written).items():
-            if given is not None:
-                cure = "Leave it out: the order has its own." if option in fixed else "Leave it out."
-                raise InputError(option, "does not go with --as-built", given, cure)
-        from doedesign.lab.as_built import as_built as predict
-
-        folder = source / "as-built"
-        with measured(source, "masks") as taken:
-            predict(source, as_built, order, process=process, out=folder)
-        print_results(folder, json_)
-        say_closing(folder, source, taken)
+        _refuse_beside_as_built(fixed, "Leave it out: the order has its own.")
+        _refuse_beside_as_built({"--out": out, "--patch": patch, "--mesh-patch": mesh_patch}, "Leave it out.")
+        _predict_as_built(source, as_built, order, process, json_)
         return
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
@@ -229,6 +219,7 @@ def masks(
         rule = "goes with a run, which says what light and what glass"
         raise InputError("--probe", rule, f"{probe} for {source}", "Leave it out.")
     from doedesign.lab.order import PROBE_M, drawn_as, write_masks
+    from doedesign.runs.costs import measured
     from fab.order.formats import Formats
 
     with measured(source if source.is_dir() else None, "masks", writes=out or Path("masks")) as taken:
@@ -256,6 +247,25 @@ def masks(
     say(f"{len(done.report.checks)} checks passed: every pixel of every file is {drawn_as(done)}")
     print_results(done.folder, json_, checks=len(done.report.checks))
     say_closing(done.folder, source if source.is_dir() else None, taken)
+
+
+def _refuse_beside_as_built(options: Mapping[str, object], cure: str) -> None:
+    """Refuse options that would do nothing with --as-built."""
+    for option, given in options.items():
+        if given is not None:
+            raise InputError(option, "does not go with --as-built", str(given), cure)
+
+
+def _predict_as_built(run: Path, sheet: Path, order: Path | None, process: str | None, as_json: bool) -> None:
+    """Predict the plate of a filled run sheet into RUN/as-built."""
+    from doedesign.lab.as_built import as_built as predict
+    from doedesign.runs.costs import measured
+
+    folder = run / "as-built"
+    with measured(run, "masks") as taken:
+        predict(run, sheet, order, process=process, out=folder)
+    print_results(folder, as_json)
+    say_closing(folder, run, taken)
 
 
 def _aperture(text: str | None) -> list[float] | str | None:

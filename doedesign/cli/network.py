@@ -227,7 +227,7 @@ def evaluate(
         images: Folder of pictures to train on; some of scikit-image's sample pictures by default.
         test: Folder of pictures to judge by, none of them trained on; the others of scikit-image's by default.
         licence: Licence of the pictures to train on, for the record.
-        train: Train the networks that are missing, with the spec's [train]; otherwise their rows are empty.
+        train: Train the networks that are missing, with the spec's [train]; otherwise their rows say why not.
         seeds: Seeds of the trainings.
         seed: Seed of the pairs.
         reflect: Mirror scenes beyond the edges of a capture, as in training, instead of letting them go on.

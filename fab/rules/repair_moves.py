@@ -197,7 +197,7 @@ def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
         before = loss(task, y0, x0, y1, x1)
         if not sound:
             before += weight * broken(task, y0, x0, y1, x1)
-        if -before >= best:  # less than nothing cannot be lost
+        if -before >= best:  # no move leaves less than nothing
             continue
         for i in range(many):
             change = _filled_loss(task, y0, x0, y1, x1, depths[i], before + best) - before
