@@ -163,22 +163,13 @@ def _filled_loss(task, y0, x0, y1, x1, depth, most):  # pragma: no cover - compi
 
 
 @njit(cache=True, nogil=True)
-def _filled_broken(task, y0, x0, y1, x1, depth):  # pragma: no cover - compiled
-    # `broken` of a rectangle if all of it had one depth.
-    kept = task.etched[y0:y1, x0:x1].copy()
-    task.etched[y0:y1, x0:x1] = depth
-    found = broken(task, y0, x0, y1, x1)
-    task.etched[y0:y1, x0:x1] = kept
-    return found
-
-
-@njit(cache=True, nogil=True)
 def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
     # Take the best of the moves that cover a pixel; tell whether there was one.
     etched = task.etched
     reach = max(task.line, task.space, 2)
     depths = np.empty(19, np.int64)
     many = _depths_near(task, y, x, reach, depths)
+    kept = np.empty((reach, reach), etched.dtype)
     best, best_depth = -1e-9, -1
     best_y = best_x = best_high = best_wide = 0
     # The pixel alone, and lines and a square with the pixel at one of their ends or corners.
@@ -192,6 +183,7 @@ def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
         for v in range(max(y0, 0), min(y1, etched.shape[0])):
             for u in range(max(x0, 0), min(x1, etched.shape[1])):
                 allowed &= task.free[v, u]
+                kept[v - y0, u - x0] = etched[v, u]
         if not allowed:
             continue
         before = loss(task, y0, x0, y1, x1)
@@ -199,14 +191,21 @@ def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
             before += weight * broken(task, y0, x0, y1, x1)
         if -before >= best:  # no move leaves less than nothing
             continue
+        written = False
         for i in range(many):
             change = _filled_loss(task, y0, x0, y1, x1, depths[i], before + best) - before
             # A move that costs more light than it can repair is not checked against the rules.
             if change < best:
-                change += weight * _filled_broken(task, y0, x0, y1, x1, depths[i])
+                etched[y0:y1, x0:x1] = depths[i]
+                written = True
+                change += weight * broken(task, y0, x0, y1, x1)
             if change < best:
                 best, best_depth = change, depths[i]
                 best_y, best_x, best_high, best_wide = y0, x0, high, wide
+        if written:
+            for v in range(y0, y1):
+                for u in range(x0, x1):
+                    etched[v, u] = kept[v - y0, u - x0]
     if best_depth < 0:
         return False
     etched[best_y : best_y + best_high, best_x : best_x + best_wide] = best_depth
