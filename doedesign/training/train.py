@@ -274,17 +274,18 @@ class JointTraining(TrainingJob):
     pictures: Mapping[str, Any]
 
     def initial(self) -> JointState:
-        """The state before the first step: the heights of the design before rounding; of rings, their profile."""
+        """The state before the first step.
+
+        It has the heights of the design before rounding, those of its levels where they are not at hand, and of rings
+        their profile.
+        """
         doe, heights = self.trainer.doe, self.design.continuous_m
         learnt = None if doe.parametrization is None else doe.learnt
         if self.options.camera == "conventional":
             shape = self.trainer.bench.camera.grid.shape if learnt is None else learnt.shape
             return self.trainer.initial(np.zeros(shape, np.float32))
-        if heights is None and self.trainer.doe.parametrization is None:
-            heights = self.design.nominal_height_m  # it stays at rest, whatever it was before rounding
         if heights is None:
-            rule, cure = "must have its heights before rounding", "Give one that was optimised, or the run of one."
-            raise InputError("design", rule, "level numbers alone", cure)
+            heights = self.design.nominal_height_m
         if learnt is not None:
             heights = learnt.heights_of(heights)
             assert heights is not None  # `optimize` writes a raster of rings for a radial design

@@ -138,6 +138,20 @@ def trained(run: Path, out: Path, images: Path, *changes: str, **more: Any) -> t
     return code, "\n".join(said)
 
 
+@pytest.mark.slow
+def test_a_plate_of_level_numbers_alone_is_learnt_further(run: Path, images: Path, tmp_path: Path) -> None:
+    """From the heights of its levels, which small steps do not leave and great ones do."""
+    given = replace(changed_design(run), continuous_m=None)
+    design_wave_m = given.levels.count * given.levels.step_m
+    for rate, stays in ((1e-6, True), (3.0, False)):
+        train(given, images, out := tmp_path / str(rate), steps=2, optics_learning_rate=rate, validate_every=2)
+        learnt = open_design(out, False)
+        assert learnt.continuous_m is not None
+        turns = (learnt.continuous_m - given.height_m) / design_wave_m
+        moved = np.abs(np.angle(np.exp(2j * np.pi * turns)))
+        assert (moved.max() < 1e-3) == (learnt.level_map.digest == given.level_map.digest) == stays
+
+
 def content(folder: Path) -> dict[str, Any]:
     """Every file, but for the seconds that steps took."""
     found: dict[str, Any] = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
