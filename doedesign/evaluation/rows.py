@@ -78,8 +78,7 @@ TRAININGS = {
         Training("no_feature_extraction", ("network.features=false",)),
         Training("sequential", ('train.freeze="optics"',)),
         Training("conventional", ('train.camera="conventional"',)),
-        # The loss falls on the capture itself: a network that hands it through, and never learns.
-        Training("optics_only", ('train.freeze="network"', "network.wiener=false", 'train.mode="simultaneous"')),
+        Training("optics_only", ('train.freeze="network"', "train.light_scenes=0")),
         Training(ROBUST, ('train.freeze="optics"',)),
         Training("pyramid_deblurring", rival="pyramid_deblurring", plate="proposed"),
         Training("plain_unet", rival="plain_unet", plate="proposed"),

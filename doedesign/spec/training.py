@@ -58,7 +58,8 @@ class TrainSpec(SpecTable, frozen=True):
         schedule: "cosine" lets both step sizes fall to a tenth, "constant" keeps them.
         mode: "simultaneous", or "alternating": the optics moves in one of `period` steps, the network in the others.
         period: steps of which one moves the optics, where `mode` is "alternating".
-        freeze: what stays as it is: "none", "optics" or "network".
+        freeze: what stays as it is: "none", "optics", or "network", with which the DOE alone learns, from what it
+            captures.
         camera: "doe", or "conventional" for the same camera with a flat plate.
         l1: weight of the mean absolute difference.
         perceptual: weight of the perceptual distance.
@@ -133,6 +134,9 @@ def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> I
         yield InputError("train.zoom", rule, str(list(train.zoom)), f"Set zoom = {sorted(train.zoom)}.")
     if train.light_scenes and not network.global_light:
         rule, cure = "needs the branch that is to learn from them", "Set network.global_light = true."
+        yield InputError("train.light_scenes", rule, str(train.light_scenes), cure)
+    if train.light_scenes and not train.moves_network:
+        rule, cure = 'must be left out with freeze = "network": there is nobody to teach', "Remove one of the two."
         yield InputError("train.light_scenes", rule, str(train.light_scenes), cure)
     # Two pixels at the coarsest scale: reflection at its border needs a neighbour.
     coarsest = 2**network.depth

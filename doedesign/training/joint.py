@@ -361,7 +361,7 @@ def _slopes(
     train = trainer.spec.train
     found = shots(seen, trainer.doe, free, rounding, trainer.bench, keys)
     half, checkpointed = train.precision == "mixed", train.checkpointing
-    picture = network(found.capture, found.far, found.near, half=half, checkpointed=checkpointed)
+    picture = _picture(network, found, train, half=half, checkpointed=checkpointed)
     reference, mask = srgb_from_linear(jnp.asarray(seen.scene.background)), seen.scene.obstructions[0].mask
     return losses(picture, reference, jnp.asarray(mask), train, trainer.perceptual)
 
@@ -428,4 +428,11 @@ def _lesson(free: Any, trainer: Trainer, seen: TrainingScene, keys: Array, scale
 @eqx.filter_jit
 def _look(network: Network, free: Any, trainer: Trainer, seen: TrainingScene, keys: Array) -> tuple[Capture, Array]:
     found = shots(seen, trainer.doe, free, ROUNDED, trainer.bench, keys)
-    return found, network(found.capture, found.far, found.near)
+    return found, _picture(network, found, trainer.spec.train)
+
+
+def _picture(network: Network, found: Capture, train: TrainSpec, **how: bool) -> Array:
+    """What the loss is of, display values: a reconstruction, or the capture itself where no network learns."""
+    if not train.moves_network:
+        return srgb_from_linear(found.capture)
+    return network(found.capture, found.far, found.near, **how)

@@ -85,6 +85,10 @@ def test_what_moves(changes: list[str], network: bool, optics: bool):
         (["network.variant=mine"], ["network.variant", "paper, release"]),
         (["network.variant=release", "network.global_light=true"], ["network.global_light", "no veil and gain"]),
         (["train.light_scenes=10"], ["train.light_scenes", "network.global_light = true"]),
+        (
+            ["train.light_scenes=10", "network.global_light=true", "train.freeze=network"],
+            ["train.light_scenes", "nobody to teach"],
+        ),
         (["train.zoom=[0.5, 0.4]"], ["train.zoom", "the smaller first", "zoom = [0.4, 0.5]"]),
         (["train.zoom=[0.5, 1.1]"], ["train.zoom", "at most 1"]),
         (["train.zoom=0.5"], ["train.zoom", "must be a list"]),

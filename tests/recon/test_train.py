@@ -19,6 +19,7 @@ from doedesign.training.checkpoint import read_checkpoint, write_checkpoint
 from doedesign.training.joint import JointState, Trainer, devices_mesh, rates_at, resting_depths_m
 from doedesign.training.train import _with_options
 from fab.errors import InputError
+from sim.light import srgb_from_linear
 from sim.obstruction import Dirt
 from tests.doedesign.calibration_fakes import plate_drawn
 from tests.recon.small_training import PLAIN, batch, heights, small_spec, trainer
@@ -100,6 +101,21 @@ def test_a_plate_at_rest_is_not_in_the_state() -> None:
     assert losses[-1] < 0.98 * losses[0]
     assert state.free is None
     assert alike(numbers(made.doe), plate)
+
+
+@pytest.mark.slow
+def test_optics_alone_learn_from_their_capture() -> None:
+    """Whatever the network that is not used would make of it."""
+    made = trainer(*PLAIN, *LEARNING, 'train.freeze="network"')
+    state = made.initial(heights())
+    capture, shown = made.reconstruct(state, batch())
+    np.testing.assert_array_equal(shown, srgb_from_linear(capture.capture))
+    other = made.initial(heights())
+    other = other._replace(network=jax.tree.map(lambda leaf: leaf + 1.0, other.network))
+    (state, found), (_, same) = (walk(made, 20, each) for each in (state, other))
+    assert found == same
+    assert found[-1] < found[0]
+    assert alike(numbers(state.network), numbers(made.initial(heights()).network))
 
 
 def test_a_conventional_camera_has_a_flat_plate() -> None:
