@@ -432,7 +432,7 @@ def _look(network: Network, free: Any, trainer: Trainer, seen: TrainingScene, ke
 
 
 def _picture(network: Network, found: Capture, train: TrainSpec, **how: bool) -> Array:
-    """What the loss is of, display values: a reconstruction, or the capture itself where no network learns."""
+    """Pictures that the loss is of, display values: reconstructions, or captures themselves where no network learns."""
     if not train.moves_network:
         return srgb_from_linear(found.capture)
     return network(found.capture, found.far, found.near, **how)
