@@ -78,6 +78,7 @@ TRAININGS = {
         Training("no_feature_extraction", ("network.features=false",)),
         Training("sequential", ('train.freeze="optics"',)),
         Training("conventional", ('train.camera="conventional"',)),
+        # Whatever the other trainings are asked for: here no network learns.
         Training("optics_only", ('train.freeze="network"', "train.light_scenes=0")),
         Training(ROBUST, ('train.freeze="optics"',)),
         Training("pyramid_deblurring", rival="pyramid_deblurring", plate="proposed"),
