@@ -27,7 +27,7 @@ from doedesign.build import process_from_spec, resolve_process, spec_from_proces
 from doedesign.calibration.unknowns import chosen_names
 from doedesign.design.design import Design
 from doedesign.design.levels.etch_depths import recipe_depth_m
-from doedesign.design.objectives import Objective, PsfSet, Term, source_digests, terms_from_spec
+from doedesign.design.objectives import Objective, PsfSet, Term, disc_radii_m, source_digests, terms_from_spec
 from doedesign.focus.depth import FocusTable
 from doedesign.optimization import write_results
 from doedesign.prediction import on_target, predict
@@ -311,10 +311,11 @@ def _loss_of(design: Design, terms: tuple[Term, ...]) -> Callable[[FabricatedDoe
     if not terms:
         return _difference_from(design)
     lens = participation(jnp.asarray(_energy(design, HeightOptic.of(camera))[:, :near]))
+    disc_m = jnp.asarray(disc_radii_m(camera, design.near_m))
 
     def loss(plate: FabricatedDoe) -> float:
         light = jnp.asarray(_energy(design, plate))
-        psfs = PsfSet(light[:, :near], light[:, near:], lens, camera)
+        psfs = PsfSet(light[:, :near], light[:, near:], lens, disc_m, camera)
         return float(sum(term.weight * term.value(psfs) for term in terms))
 
     return loss

@@ -396,7 +396,8 @@ def errors_of(design: Design, spec: Spec) -> dict[str, float]:
     camera = replace(design.camera, window=spec.sensor.window)
     height = design.nominal_height_m
     far = psf(height, camera, depths_of(spec)).energy
-    view = PsfSet(jnp.zeros((3, 0, camera.window, camera.window)), jnp.asarray(far), jnp.zeros((3, 0)), camera)
+    near = jnp.zeros((3, 0, camera.window, camera.window))
+    view = PsfSet(near, jnp.asarray(far), jnp.zeros((3, 0)), jnp.zeros(0), camera)
     options: dict[str, Any] = dict(spec.objectives[0].options)
     return {
         "mean": float(filtered_error(view, **options)),

@@ -87,6 +87,14 @@ def energy_within(psf: Psf, pixel_m: float, radius_m: float) -> Number:
     return energy if is_traced(energy) else float(energy)
 
 
+def disc_radius_m(camera: Camera, depth_m: float) -> float:
+    """Radius of the disc to which light of `depth_m`, metres, is blurred if the DOE does not diffract it.
+
+    That of geometric defocus, and one pixel.
+    """
+    return camera.defocus_radius_m(depth_m) + camera.pixel_m
+
+
 class RingToDisc(NamedTuple):
     """Energy outside and inside the geometric defocus disc, within the window; lengths in metres."""
 
@@ -99,10 +107,9 @@ class RingToDisc(NamedTuple):
 def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
     """Ring:disc ratio of a near `psf` `[y, x]` of a `camera` (3:1 in the paper's simulation, 1:1 in its prototype).
 
-    The disc is the geometric defocus disc of `depth_m`, metres, widened by one pixel, where light that the DOE does not
-    diffract lands; without light in it the ratio is infinite.
+    The disc is that of `disc_radius_m`, `depth_m` in metres; without light in it the ratio is infinite.
     """
-    radius = camera.defocus_radius_m(depth_m) + camera.pixel_m
+    radius = disc_radius_m(camera, depth_m)
     disc = energy_within(psf, camera.pixel_m, radius)
     ring = total(psf) - disc
     if is_traced(disc):
@@ -426,7 +433,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         ),
         "disc_radius_m": Metric(
             "radius of the defocus disc",
-            lambda e, c, d: e.camera.defocus_radius_m(e.depths_m[d]) + e.camera.pixel_m,
+            lambda e, c, d: disc_radius_m(e.camera, e.depths_m[d]),
             ("design",),
             "near",
             unit="m",

@@ -27,7 +27,7 @@ from doedesign.calibration.target import Image, match
 from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.metrics import spot_radius_m
+from sim.metrics import disc_radius_m, spot_radius_m
 
 DETERMINED = 0.5  # of the prior's standard deviation
 _DIRECTIONS = 2  # least known ones that are looked at
@@ -178,7 +178,7 @@ def readings(fit: Linearization, posterior: Posterior) -> list[Reading]:
     spot_m = spot_radius_m(camera, objective.model.wavelength_m)
     for i, found in enumerate(at.matches):
         target, image, weights = found.target, found.model, found.weights
-        disc_m = camera.defocus_radius_m(target.image.depth_m) + camera.pixel_m
+        disc_m = disc_radius_m(camera, target.image.depth_m)
         near = disc_m > spot_m
         y, x = (float(shift) * camera.pixel_m for shift in objective.motion(at.scores, i)[:2])
         inner = circle_coverage(grid, 2 * (disc_m if near else spot_m), (y, x)).astype(np.float64)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import binary_erosion
 
-from doedesign.design.objectives import PsfSet, Term
+from doedesign.design.objectives import PsfSet, Term, disc_radii_m
 from doedesign.design.patterns import offset_m, positive_place, spot_centres_m
 from doedesign.spec import Spec
 from sim.camera import Camera
@@ -61,7 +61,9 @@ def all_of(bank: PsfBank, lens: PsfBank, near: int) -> PsfSet:
     if bank.camera is None:
         raise ValueError("`bank.camera` must be known for objectives, but it is None; give it by `bank.with_camera`")
     energy = jnp.asarray(bank.energy)
-    return PsfSet(energy[:, :near], energy[:, near:], participation(jnp.asarray(lens.energy))[:, :near], bank.camera)
+    disc_m = jnp.asarray(disc_radii_m(bank.camera, bank.depths_m[:near]))
+    blur = participation(jnp.asarray(lens.energy))[:, :near]
+    return PsfSet(energy[:, :near], energy[:, near:], blur, disc_m, bank.camera)
 
 
 class DrawnPattern(NamedTuple):

@@ -13,13 +13,14 @@ spec may look at some colours and depths only, and at the worst of them instead 
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,9 +31,10 @@ from doedesign.spec.models import ObjectiveSpec
 from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
 from fab.files import sha256_file
+from sim.aperture import open_shares
 from sim.camera import Camera
 from sim.imaging.filtering import filter_errors, photograph_spectrum, transfers
-from sim.metrics import disc_weights, mean_wavelength_m, participation, spot_radius_m
+from sim.metrics import disc_radius_m, disc_weights, mean_wavelength_m, participation, spot_radius_m
 
 Objective = Callable[..., Array]
 """Function of a `PsfSet` and options to a number that is minimised."""
@@ -45,6 +47,7 @@ class PsfSet(eqx.Module):
         near: `[w, n, y, x]` PSFs of obstruction depths (none if the scene has none).
         far: `[w, f, y, x]` PSFs of scene depths.
         lens_participation: `[w, n]` sum of squared pixel energies of the plain lens at the same near depths.
+        disc_radius_m: `[n]` radius of the blur disc at these depths, metres (`sim.metrics.disc_radius_m`).
         camera: optics and sensor.
         worst: whether the worst colour and depth counts, in place of their mean.
     """
@@ -52,6 +55,7 @@ class PsfSet(eqx.Module):
     near: Float[Array, "w n y x"]
     far: Float[Array, "w f y x"]
     lens_participation: Float[Array, "w n"]
+    disc_radius_m: Float[Array, " n"]
     camera: Camera = eqx.field(static=True)
     worst: bool = eqx.field(static=True, default=False)
 
@@ -96,7 +100,7 @@ class Cases(NamedTuple):
             for some, count in zip(self[:3], every, strict=True)
         )
         near, far, lens = psfs.near[c][:, n], psfs.far[c][:, f], psfs.lens_participation[c][:, n]
-        return PsfSet(near, far, lens, self.camera(psfs.camera), self.worst)
+        return PsfSet(near, far, lens, psfs.disc_radius_m[n], self.camera(psfs.camera), self.worst)
 
 
 class Term(NamedTuple):
@@ -115,6 +119,11 @@ class Term(NamedTuple):
     def target(self) -> Float[np.ndarray, "y x"] | None:
         """Target image of a `target_pattern`: energy per pixel, summing to 1."""
         return self.function.keywords.get("target")
+
+
+def disc_radii_m(camera: Camera, near_m: Sequence[float]) -> Float[np.ndarray, " n"]:
+    """Radii of the blur discs of near depths, metres, as a `PsfSet` has them."""
+    return np.array([disc_radius_m(camera, depth_m) for depth_m in near_m], np.float32)
 
 
 def spot_weights(camera: Camera) -> Float[np.ndarray, "w y x"]:
@@ -153,6 +162,25 @@ def near_spread(psfs: PsfSet) -> Array:
     has s = (1 / (2w) + a) / (1 + a).
     """
     return psfs.highest(participation(psfs.near) / psfs.lens_participation)
+
+
+def ring_to_disc(psfs: PsfSet, *, least: float) -> Array:
+    """Squared lack of the ring:disc ratio below `least`, over colours and near depths: a constraint.
+
+    The disc is where the plain lens blurs the light of that depth to, the ring is the rest of the window
+    (`sim.metrics.ring_to_disc`). It is zero for a design that holds it; with a large weight the other terms decide all
+    else.
+
+    Raises:
+        InputError: a ratio that is not positive.
+    """
+    if not isinstance(least, int | float) or isinstance(least, bool) or not least > 0:
+        raise InputError("ring_to_disc: least", "must be a ratio above 0", repr(least), "For example 1.5.")
+    middle = jnp.arange(psfs.near.shape[-1]) - psfs.near.shape[-1] // 2
+    inside = jax.vmap(partial(open_shares, middle, middle))(psfs.disc_radius_m / psfs.camera.pixel_m)
+    disc = jnp.einsum("wnyx,nyx->wn", psfs.near, inside)
+    ring = jnp.sum(psfs.near, axis=(-2, -1)) - disc
+    return psfs.highest(jnp.maximum(least - ring / disc, 0.0) ** 2)
 
 
 def window_loss(psfs: PsfSet) -> Array:

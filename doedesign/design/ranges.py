@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from doedesign.design.objectives import disc_radii_m
 from doedesign.design.problem import Problem, StepSources
 from doedesign.spec import Spec
 from sim.metrics import participation
@@ -101,7 +102,8 @@ class SourceRange:
         if len(near):
             at, nodes = np.log(1 / np.asarray(near)), np.log(self.nodes_per_m)
             lens = np.array([np.exp(np.interp(at, nodes, np.log(row))) for row in self.lens], np.float32)
-        return listed._replace(near=near_sources, far=far_sources, lens=jnp.asarray(lens))
+        disc_m = jnp.asarray(disc_radii_m(problem.camera, near))
+        return listed._replace(near=near_sources, far=far_sources, lens=jnp.asarray(lens), disc_m=disc_m)
 
 
 def _depth_m(per_m: float) -> float:

@@ -345,6 +345,7 @@ def _cases(spec: Spec, index: int) -> Iterator[InputError]:
     looks = {
         **dict.fromkeys(("far_spot", "spot_energy", "equal_colours", "target_pattern", "filtered_error"), ("far",)),
         "near_spread": ("near",),
+        "ring_to_disc": ("near",),
         "handcrafted": ("near", "far"),
     }
     depths = {"near": scene.near_m, "far": scene.far_m}

@@ -15,12 +15,14 @@ from scipy import special
 from doedesign.design.objectives import (
     BUILT_IN,
     PsfSet,
+    disc_radii_m,
     equal_colours,
     far_spot,
     filtered_error,
     handcrafted,
     import_objectives,
     near_spread,
+    ring_to_disc,
     source_digests,
     spot_energy,
     spot_weights,
@@ -36,16 +38,18 @@ from fab.errors import InputError
 from fab.files import sha256_file
 from fab.grid import Grid
 from fab.pictures import write_pixels
+from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
 from sim.metrics import participation
 from sim.psf_bank import psf
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CAMERA = Camera(Grid((64, 64), 10e-6), 0.64e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 5e-3, 4e-6, 64)
+DISC, NO_DISC = jnp.full(1, 40e-6), jnp.zeros(0)  # ten pixels; of a scene without near depths
 
 
 def view(near: np.ndarray, far: np.ndarray, lens: float = 1.0) -> PsfSet:
-    return PsfSet(jnp.asarray(near)[None, None], jnp.asarray(far)[None, None], jnp.full((1, 1), lens), CAMERA)
+    return PsfSet(jnp.asarray(near)[None, None], jnp.asarray(far)[None, None], jnp.full((1, 1), lens), DISC, CAMERA)
 
 
 def even() -> np.ndarray:
@@ -87,7 +91,7 @@ def of_spots(*spots: float, window: float = 1.0) -> PsfSet:
     camera = replace(CAMERA, colours=tuple(Colour(str(i), (550e-9,), (1.0,)) for i in range(len(spots))))
     far = np.stack([spot * point() for spot in spots])[:, None]
     far[:, 0, 0, 0] += window - np.array(spots, np.float32)
-    return PsfSet(jnp.asarray(far), jnp.asarray(far), jnp.ones((len(spots), 1)), camera)
+    return PsfSet(jnp.asarray(far), jnp.asarray(far), jnp.ones((len(spots), 1)), DISC, camera)
 
 
 def test_a_stated_spot_and_equal_colours_by_hand() -> None:
@@ -101,6 +105,31 @@ def test_a_stated_spot_and_equal_colours_by_hand() -> None:
 def test_the_window_costs_nothing_where_it_holds_enough() -> None:
     assert float(window_share(of_spots(0.3, window=0.7), least=0.8)) == pytest.approx(0.01, rel=1e-4)
     assert float(window_share(of_spots(0.3, window=0.85), least=0.8)) == 0.0
+
+
+def test_ring_to_disc_costs_nothing_where_it_is_held() -> None:
+    """An even window: pi 10^2 pixels of 64^2 in the disc, less by 1e-3, for squares at its edge are cut by a line."""
+    disc = np.pi * 100 / 64**2
+    ratio = (1 - disc) / disc
+    psfs = view(even(), point())
+    assert float(ring_to_disc(psfs, least=ratio + 2)) == pytest.approx(4.0, rel=0.02)
+    assert float(ring_to_disc(psfs, least=0.9 * ratio)) == 0.0
+    assert float(ring_to_disc(view(point(), point()), least=1.5)) == pytest.approx(1.5**2, rel=1e-5)
+    for least in (0, -1.0, True):
+        with pytest.raises(InputError, match="ring_to_disc: least: must be a ratio above 0"):
+            ring_to_disc(psfs, least=least)
+
+
+def test_ring_to_disc_is_that_of_the_metrics() -> None:
+    """Of every colour and depth; the metric cuts the edge's squares into strips."""
+    (term,), psfs, near, _ = three_colours("{ name = 'ring_to_disc', options = { least = 30.0 } }")
+    pixel_m, side = psfs.camera.pixel_m, psfs.camera.window
+    lacks = []
+    for depth, radius_m in enumerate(np.asarray(psfs.disc_radius_m)):
+        assert radius_m == pytest.approx(psfs.camera.defocus_radius_m((5e-3, 10e-3)[depth]) + pixel_m, rel=1e-6)
+        disc = (near[:, depth] * circle_coverage(Grid((side, side), pixel_m), 2 * float(radius_m))).sum((1, 2))
+        lacks.append(np.maximum(30 - (near[:, depth].sum((1, 2)) - disc) / disc, 0) ** 2)
+    assert float(term.value(psfs)) == pytest.approx(np.mean(lacks), rel=1e-3)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.5, True])
@@ -125,7 +154,7 @@ def test_handcrafted_off_its_targets_by_hand() -> None:
     targets = spots / spots.sum(axis=(1, 2), keepdims=True)
     far = np.stack([0.5 * targets[0], 0.8 * targets[1]])[:, None]
     near = np.broadcast_to(point(), (2, 1, 64, 64))
-    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.ones((2, 1)), camera)
+    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.ones((2, 1)), DISC, camera)
     missed, spread = (0.5**2 + 0.2**2) / 2, np.log(1 + (64**2 / 4 - 1))
     assert float(handcrafted(psfs)) == pytest.approx(missed + spread, rel=1e-5)
     assert float(handcrafted(psfs, near_weight=3.0)) == pytest.approx(missed + 3 * spread, rel=1e-5)
@@ -139,7 +168,7 @@ def test_target_pattern_off_its_target_by_hand() -> None:
     other = np.roll(target, 9, axis=0)
     for image, wanted in ((0.4 * target, 0.36), (1.5 * target, 0.25), (0 * target, 1.0), (other, 2.0)):
         assert float(BUILT_IN["target_pattern"](view(even(), image), target=target)) == pytest.approx(wanted, rel=1e-6)
-    both = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.stack([0.4 * target, other])[None], jnp.zeros((1, 0)), CAMERA)
+    both = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.stack([0.4 * target, other])[None], jnp.zeros((1, 0)), NO_DISC, CAMERA)
     assert float(BUILT_IN["target_pattern"](both, target=target)) == pytest.approx((0.36 + 2) / 2, rel=1e-6)
 
 
@@ -232,7 +261,9 @@ def test_target_pattern_is_zero_when_all_light_is_on_target() -> None:
     (term,) = terms_from_spec(spec, camera, {})
     target = target_image(camera, dict(spec.objectives[0].options), None, "objective")
     assert target.sum() == pytest.approx(1.0, abs=1e-5)
-    images = PsfSet(jnp.zeros((1, 0, *target.shape)), jnp.asarray(target)[None, None], jnp.zeros((1, 0)), camera)
+    images = PsfSet(
+        jnp.zeros((1, 0, *target.shape)), jnp.asarray(target)[None, None], jnp.zeros((1, 0)), NO_DISC, camera
+    )
     assert float(term.value(images)) == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_array_equal(np.asarray(term.target), target)
     assert terms_from_spec(load_spec(EXAMPLES / "quick.toml"), CAMERA, {})[0].target is None
@@ -257,9 +288,16 @@ def test_a_picture_is_a_target_with_its_top_at_the_highest_y(tmp_path: Path) -> 
 def test_the_objectives_are_those_of_the_spec() -> None:
     """And each says by itself whether it looks at near depths, as the spec's table does."""
     assert BUILT_IN.keys() == set(OBJECTIVES)
-    given = {"target_pattern": {"target": even()}, "spot_energy": {"energy": 0.3}, "window_share": {"least": 0.5}}
+    given = {
+        "target_pattern": {"target": even()},
+        "spot_energy": {"energy": 0.3},
+        "window_share": {"least": 0.5},
+        "ring_to_disc": {"least": 1.5},
+    }
     for name in OBJECTIVES:
-        without = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(point())[None, None], jnp.zeros((1, 0)), CAMERA)
+        without = PsfSet(
+            jnp.zeros((1, 0, 64, 64)), jnp.asarray(point())[None, None], jnp.zeros((1, 0)), NO_DISC, CAMERA
+        )
         value = float(BUILT_IN[name](without, **given.get(name, {})))
         assert np.isnan(value) == (name in NEAR_OBJECTIVES), name
 
@@ -270,7 +308,7 @@ def test_one_filter_for_all_depths_wants_psfs_that_are_alike() -> None:
     blur[30:34, 30:34] = 1 / 16
 
     def both(*far: np.ndarray) -> PsfSet:
-        return PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(np.stack(far))[None], jnp.zeros((1, 0)), CAMERA)
+        return PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(np.stack(far))[None], jnp.zeros((1, 0)), NO_DISC, CAMERA)
 
     alike = [float(filtered_error(both(one, one))) for one in (point(), blur)]
     apart, known = (float(filtered_error(both(point(), blur), known=way)) for way in (False, True))
@@ -310,7 +348,8 @@ def three_colours(*objectives: str) -> tuple[tuple[Any, ...], PsfSet, np.ndarray
 
     camera, rng = camera_from_spec(spec), np.random.default_rng(3)
     near, far = rng.uniform(0, 1, (2, 3, 2, camera.window, camera.window)).astype(np.float32) / camera.window**2
-    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.full((3, 2), 1e-6), camera)
+    disc_m = jnp.asarray(disc_radii_m(camera, spec.scene.near_m))
+    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.full((3, 2), 1e-6), disc_m, camera)
     return terms_from_spec(spec, camera, {}), psfs, near, far
 
 

@@ -1,6 +1,6 @@
 """Bars of all that was asked of a design and reached, the 0th order on its way to the wafer, and the yield."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from doedesign.report.page.blocks import Bar, BarBlock, PageSection, TableBlock, section
@@ -101,13 +101,20 @@ def _plates(files: RunFiles, metrics: Mapping[str, Any]) -> Iterator[Bar | None]
         bound = sum(bounds) / len(bounds) if bounds else None
         given = {} if bound is None else {"mark": bound, "mark_text": f"bound {number(bound)} (less is spread wider)"}
         yield _bar("concentration of near light", [row["concentration"] for row in near], "concentration", **given)
-        yield _bar("ring:disc of near light", [row.get("ring_to_disc") for row in near], "ring_to_disc")
-    least = options.get("window_share", {}).get("least")
-    given = {"mark": least, "mark_text": f"at least {percent(least)}"} if _is_number(least) else {}
-    if given:
-        met = all(row["throughput"] >= least for row in rows)
-        given["state"] = "met" if met else "missed"
-    yield _bar("throughput, light in the window", [row.get("throughput") for row in rows], "throughput", **given)
+        ratios = [row.get("ring_to_disc") for row in near]
+        given = _at_least(options.get("ring_to_disc", {}).get("least"), ratios, number)
+        yield _bar("ring:disc of near light", ratios, "ring_to_disc", **given)
+    shares = [row.get("throughput") for row in rows]
+    given = _at_least(options.get("window_share", {}).get("least"), shares, percent)
+    yield _bar("throughput, light in the window", shares, "throughput", **given)
+
+
+def _at_least(least: Any, values: Sequence[Any], words: Callable[[float], str]) -> dict[str, Any]:
+    """The mark of a bar whose values an objective keeps from below, and whether all reach it."""
+    if not _is_number(least):
+        return {}
+    met = all(value is None or value >= least for value in values)
+    return {"mark": least, "mark_text": f"at least {words(least)}", "state": "met" if met else "missed"}
 
 
 def _is_number(value: Any) -> bool:

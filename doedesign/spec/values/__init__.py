@@ -28,6 +28,7 @@ BEAM_FILES = (".png", ".tif", ".tiff")
 OBJECTIVES = (
     "far_spot",
     "near_spread",
+    "ring_to_disc",
     "window_loss",
     "spot_energy",
     "equal_colours",
@@ -38,7 +39,7 @@ OBJECTIVES = (
 )
 # The ways to round in the loop (`doedesign.design.levels.quantisation`) that draw levels at random.
 RANDOM_QUANTISATIONS = ("gumbel", "stochastic")
-NEAR_OBJECTIVES = ("near_spread", "handcrafted")
+NEAR_OBJECTIVES = ("near_spread", "ring_to_disc", "handcrafted")
 # Those that have one answer for all depths, and look at all of them in every step.
 DEPTHS_OBJECTIVES = ("filtered_error",)
 
