@@ -2,8 +2,8 @@
 
     python examples/compare_splitters.py [--draws 200] [--processes contact_aligner direct_write] [--out FOLDER]
 
-One beam becomes nine in a row, by unit cells of 512 um, and five by five, by unit cells of 192 um, 16 levels each.
-`spots.uniformity_as_fabricated` is the only difference between two designs. Plates are then drawn from every process,
+One beam becomes nine in a row, by unit cells of 1024 um, and five by five, by unit cells of 384 um, 16 levels each: the
+smaller a cell, the more it suffers from masks that lie apart. `spots.uniformity_as_fabricated` is the only difference between two designs. Plates are then drawn from every process,
 the first of which is the one that the designs know, with errors that no design has seen, and judged by the whole model
 of the process (`sim.surface`). Five minutes on two cores.
 """
@@ -28,9 +28,9 @@ from sim.optic import HeightOptic
 
 SEED = 4711  # of the plates, which no design draws from
 # Spots along x and y, period, and what equal light is worth: of the plate as drawn, and of plates as fabricated.
-SPLITTERS = {"1 x 9": ([9, 1], "512 um", 3.0, 6.0), "5 x 5": ([5, 5], "192 um", 3.0, 2.0)}
+SPLITTERS = {"1 x 9": ([9, 1], "1024 um", 3.0, 6.0), "5 x 5": ([5, 5], "384 um", 3.0, 1.0)}
 DESIGNS = ("as drawn", "as fabricated")
-SMALL = ("doe.samples=384", "doe.aperture=0.768 mm")  # one period or more in the largest square of the aperture
+SMALL = ("doe.samples=768", "doe.aperture=1.536 mm")  # one period or more in the largest square of the aperture
 
 
 class Splitter(NamedTuple):

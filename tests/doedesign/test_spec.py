@@ -172,10 +172,19 @@ def test_overrides_change_single_values():
     assert spec.sensor.defocus_m == -20e-6
 
 
+def test_an_override_of_the_entry_after_the_last_adds_one():
+    added = "objective[4]={ name='ring_to_disc', weight=0.5, options={ least=1.5 } }"
+    spec = load_spec(AUTOMOTIVE, [added, "objective[4].weight=0.7"])
+    assert [one.name for one in spec.objectives][3:] == ["spot_energy", "ring_to_disc"]
+    assert (spec.objectives[4].weight, dict(spec.objectives[4].options)) == (0.7, {"least": 1.5})
+    assert "objective[4]: must" in refusal(AUTOMOTIVE, "objective[4]=far_spot")
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
         ("process.levels", 'an override must be KEY=VALUE, but got "process.levels"'),
+        ("objective.5={ name='far_spot' }", "`5` must be an entry of what the spec holds there, but got a list of 4"),
         ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 4"),
         ("name.first=1", "`first` must be an entry of what the spec holds there, but got a single value"),
         ("process.levls=8", "overrides: process.levls: must be a known key of [process], but got `levls`. Did"),

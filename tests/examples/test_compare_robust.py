@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from doedesign.design.problem import problem_of
 from doedesign.optimization import optimize
 from doedesign.spec import load_spec
 from tests.doedesign.small_runs import SPREAD
@@ -24,7 +25,8 @@ def spec(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_plates_of_a_process_without_errors_are_as_drawn(spec: Path):
-    found = compare_robust.plates_of("small", optimize(load_spec(spec)), "ideal", 3)
+    small = load_spec(spec)
+    found = compare_robust.plates_of("small", optimize(small), "ideal", 3, problem_of(small, {})[0].terms)
     # Two programs for the same plate: single precision.
     assert found.mean_loss == pytest.approx(found.drawn_loss, rel=1e-5)
     assert found.ring_to_disc_of_90_percent == pytest.approx(found.drawn_ring_to_disc, rel=1e-4)
