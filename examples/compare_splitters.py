@@ -3,9 +3,10 @@
     python examples/compare_splitters.py [--draws 200] [--processes contact_aligner direct_write] [--out FOLDER]
 
 One beam becomes nine in a row, by unit cells of 1024 um, and five by five, by unit cells of 384 um, 16 levels each: the
-smaller a cell, the more it suffers from masks that lie apart. `spots.uniformity_as_fabricated` is the only difference between two designs. Plates are then drawn from every process,
-the first of which is the one that the designs know, with errors that no design has seen, and judged by the whole model
-of the process (`sim.surface`). Some ten minutes on two cores.
+smaller a cell, the more it suffers from masks that lie apart. `spots.uniformity_as_fabricated` is the only difference
+between two designs. Plates are then drawn from every process, the first of which is the one that the designs know, with
+errors that no design has seen, and judged by the whole model of the process (`sim.surface`). Some ten minutes on two
+cores.
 """
 
 import argparse
