@@ -265,10 +265,12 @@ def _put(raw: dict[str, Any], key: str, value: Any) -> None:
     place: Any = raw
     for part in parents:
         place = place.setdefault(part, {}) if isinstance(place, dict) else place[_index(place, part, key)]
-    if isinstance(place, list) and last == str(len(place)):
+    if isinstance(place, dict):
+        place[last] = value
+    elif isinstance(place, list) and last == str(len(place)):
         place.append(value)  # the entry after the last one: another objective or limit
-        return
-    place[last if isinstance(place, dict) else _index(place, last, key)] = value
+    else:
+        place[_index(place, last, key)] = value
 
 
 def _index(place: Any, part: str, key: str) -> int:
