@@ -17,6 +17,7 @@ half minutes on two cores.
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -69,17 +70,36 @@ def release(
         write_atomic(out / name, (run / name).read_bytes())
     write_atomic(out / TOLERANCE, canonical_json(record))
     digest = read_level_map(out / LEVEL_MAP).digest
-    text = words(design.name, out.name, spec, digest, read_json(out / "metrics.json")["psf"], record, str(found.yield_))
-    write_atomic(out / "README.md", text.encode())
     manifest = read_json(run / MANIFEST_NAME)
+    command = " \\\n        ".join(
+        [
+            f"doedesign optimize {spec} --out runs/{out.name}",
+            *(f"--set {quoted(one)}" for one in manifest["overrides"]),
+        ]
+    )
+    rows = read_json(out / "metrics.json")["psf"]
+    text = words(design.name, out.name, spec, command, digest, rows, record, str(found.yield_))
+    write_atomic(out / "README.md", text.encode())
     names = (*COPIED, TOLERANCE, "README.md")
     digests = {name: sha256_file(out / name) for name in sorted(names)}
     said = manifest | {"results_sha256": digests}
     write_atomic(out / MANIFEST_NAME, canonical_json(said))
 
 
+def quoted(text: str) -> str:
+    """A word as a shell reads it, in double quotes where it holds single ones and nothing that a shell replaces."""
+    return f'"{text}"' if "'" in text and not set(text) & set('"$`\\!') else shlex.quote(text)
+
+
 def words(
-    name: str, folder: str, spec: str, digest: str, rows: Sequence[dict[str, Any]], record: dict[str, Any], share: str
+    name: str,
+    folder: str,
+    spec: str,
+    command: str,
+    digest: str,
+    rows: Sequence[dict[str, Any]],
+    record: dict[str, Any],
+    share: str,
 ) -> str:
     """The README of a folder: numbers as drawn and as predicted, and the commands that make it again."""
     drawn = ["| | " + " | ".join(dict.fromkeys(row["colour"] for row in rows)) + " |"]
@@ -109,8 +129,7 @@ def words(
     parts = [
         f"# {name}",
         f"A plate to see through, from `{spec}`; digest of its level map {digest[:16]}. It was made by",
-        f"    doedesign optimize {spec} --out runs/{folder}\n"
-        f"    python examples/release_design.py runs/{folder} --draws {count} --spec {spec}",
+        f"    {command}\n    python examples/release_design.py runs/{folder} --draws {count} --spec {spec}",
         "and is a run itself: `doedesign masks` draws its order; `doedesign psf`, `tolerance` and `simulate` take it.\n"
         "The same bytes come out on the same processor and libraries; on others some cells may take another level.",
         "As drawn, shares of the incident light (concentration: over that of the plain lens):",

@@ -333,7 +333,7 @@ FOLDERS: tuple[WrittenFolder, ...] = (
         ),
     ),
     WrittenFolder(
-        "masks/automotive-2400/, masks/dslr-2800/",
+        "masks/automotive-2400/, masks/automotive-robust-2400/, masks/dslr-2800/",
         "examples/release_design.py",
         "Released full-size designs.",
         (

@@ -76,6 +76,7 @@ def test_released_folders_are_found_and_whole():
     found = by_name(list_results([MASKS]))
     released = {
         "automotive-2400": ("run", "done"),
+        "automotive-robust-2400": ("run", "done"),
         "dslr-2800": ("run", "done"),
         "example": ("order", "done"),
         "released": ("released model", "done"),

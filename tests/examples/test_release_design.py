@@ -1,6 +1,7 @@
 """Designs that are given away: the script that makes their folders, and the folders as they are released."""
 
 import json
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,11 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import release_design  # pyright: ignore[reportMissingImports]
 
 MASKS = Path(__file__).parents[2] / "masks"
-RELEASED = {"automotive-2400": "examples/automotive.toml", "dslr-2800": "examples/dslr.toml"}
+RELEASED = {
+    "automotive-2400": "examples/automotive.toml",
+    "automotive-robust-2400": "examples/automotive.toml",
+    "dslr-2800": "examples/dslr.toml",
+}
 MOST_BYTES = 4_100_000  # of a folder: four bits for each of 2800 x 2800 cells, and little besides
 
 released = pytest.mark.parametrize("name", RELEASED)
@@ -50,6 +55,9 @@ def test_a_released_design_is_what_its_manifest_says(name: str):
     tolerance = json.loads((folder / "tolerance.json").read_text())
     assert tolerance["process"] == "contact_aligner"
     assert 0 <= tolerance["plates"]["yield"]["share"] <= 1
+    command = told.partition("    doedesign ")[2].partition("    python ")[0].replace("\\\n", "")
+    asked = shlex.split(command)
+    assert [asked[place + 1] for place, word in enumerate(asked) if word == "--set"] == manifest["overrides"]
 
 
 @here

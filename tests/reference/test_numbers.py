@@ -265,7 +265,7 @@ def test_definitions_are_complete() -> None:
     assert {"colour", *CertifiedOrder._fields} - {"colour"} <= set(METRICS_GROUPS[4].numbers) | {"colour"}
 
 
-@pytest.mark.parametrize("design", ["automotive-2400", "dslr-2800"])
+@pytest.mark.parametrize("design", ["automotive-2400", "automotive-robust-2400", "dslr-2800"])
 def test_released_designs_have_todays_names(design: str) -> None:
     metrics = json.loads((ROOT / "masks" / design / "metrics.json").read_text())
     assert {name for name in names_in(metrics) if number(name) is None} == set()

@@ -83,7 +83,10 @@ def test_tables_have_no_open_cells(texts: dict[str, str]) -> None:
 
 @pytest.mark.parametrize(
     "folder",
-    ["masks/automotive-2400", "masks/dslr-2800", "masks/released", *(f"masks/released-{kind}" for kind in KINDS)],
+    [
+        *(f"masks/{design}" for design in ("automotive-2400", "automotive-robust-2400", "dslr-2800", "released")),
+        *(f"masks/released-{kind}" for kind in KINDS),
+    ],
 )
 def test_files_of_released_folders_are_described(folder: str) -> None:
     entry = next(one for one in FOLDERS if f"{folder}/" in one.path)
