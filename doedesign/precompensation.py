@@ -311,11 +311,11 @@ def _loss_of(design: Design, terms: tuple[Term, ...]) -> Callable[[FabricatedDoe
     if not terms:
         return _difference_from(design)
     lens = participation(jnp.asarray(_energy(design, HeightOptic.of(camera))[:, :near]))
-    disc_m = jnp.asarray(disc_radii_m(camera, design.near_m))
+    disc_radius_m = jnp.asarray(disc_radii_m(camera, design.near_m))
 
     def loss(plate: FabricatedDoe) -> float:
         light = jnp.asarray(_energy(design, plate))
-        psfs = PsfSet(light[:, :near], light[:, near:], lens, disc_m, camera)
+        psfs = PsfSet(light[:, :near], light[:, near:], lens, disc_radius_m, camera)
         return float(sum(term.weight * term.value(psfs) for term in terms))
 
     return loss

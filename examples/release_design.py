@@ -71,19 +71,23 @@ def release(
     write_atomic(out / TOLERANCE, canonical_json(record))
     digest = read_level_map(out / LEVEL_MAP).digest
     manifest = read_json(run / MANIFEST_NAME)
-    command = " \\\n        ".join(
-        [
-            f"doedesign optimize {spec} --out runs/{out.name}",
-            *(f"--set {quoted(one)}" for one in manifest["overrides"]),
-        ]
-    )
+    commands = commands_of(f"runs/{out.name}", spec, manifest["overrides"], draws)
     rows = read_json(out / "metrics.json")["psf"]
-    text = words(design.name, out.name, spec, command, digest, rows, record, str(found.yield_))
+    text = words(design.name, spec, commands, digest, rows, record, str(found.yield_))
     write_atomic(out / "README.md", text.encode())
     names = (*COPIED, TOLERANCE, "README.md")
     digests = {name: sha256_file(out / name) for name in sorted(names)}
     said = manifest | {"results_sha256": digests}
     write_atomic(out / MANIFEST_NAME, canonical_json(said))
+
+
+def commands_of(run: str, spec: str, overrides: Sequence[str], draws: int) -> str:
+    """The commands that make a folder again, indented."""
+    changes = "".join(f" \\\n        --set {quoted(one)}" for one in overrides)
+    return (
+        f"    doedesign optimize {spec} --out {run}{changes}\n"
+        f"    python examples/release_design.py {run} --draws {draws} --spec {spec}"
+    )
 
 
 def quoted(text: str) -> str:
@@ -93,15 +97,14 @@ def quoted(text: str) -> str:
 
 def words(
     name: str,
-    folder: str,
     spec: str,
-    command: str,
+    commands: str,
     digest: str,
     rows: Sequence[dict[str, Any]],
     record: dict[str, Any],
     share: str,
 ) -> str:
-    """The README of a folder: numbers as drawn and as predicted, and the commands that make it again."""
+    """The README of a folder: the commands that make it again, and numbers as drawn and as predicted."""
     drawn = ["| | " + " | ".join(dict.fromkeys(row["colour"] for row in rows)) + " |"]
     drawn.append("|---" * drawn[0].count(" | ") + "|---|")
     for depth in dict.fromkeys(row["depth_m"] for row in rows):
@@ -129,7 +132,7 @@ def words(
     parts = [
         f"# {name}",
         f"A plate to see through, from `{spec}`; digest of its level map {digest[:16]}. It was made by",
-        f"    {command}\n    python examples/release_design.py runs/{folder} --draws {count} --spec {spec}",
+        commands,
         "and is a run itself: `doedesign masks` draws its order; `doedesign psf`, `tolerance` and `simulate` take it.\n"
         "The same bytes come out on the same processor and libraries; on others some cells may take another level.",
         "As drawn, shares of the incident light (concentration: over that of the plain lens):",

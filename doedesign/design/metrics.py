@@ -61,9 +61,9 @@ def all_of(bank: PsfBank, lens: PsfBank, near: int) -> PsfSet:
     if bank.camera is None:
         raise ValueError("`bank.camera` must be known for objectives, but it is None; give it by `bank.with_camera`")
     energy = jnp.asarray(bank.energy)
-    disc_m = jnp.asarray(disc_radii_m(bank.camera, bank.depths_m[:near]))
+    disc_radius_m = jnp.asarray(disc_radii_m(bank.camera, bank.depths_m[:near]))
     blur = participation(jnp.asarray(lens.energy))[:, :near]
-    return PsfSet(energy[:, :near], energy[:, near:], blur, disc_m, bank.camera)
+    return PsfSet(energy[:, :near], energy[:, near:], blur, disc_radius_m, bank.camera)
 
 
 class DrawnPattern(NamedTuple):

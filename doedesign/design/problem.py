@@ -35,7 +35,7 @@ class StepSources(NamedTuple):
         near: `[line][depth]` sources at near depths.
         far: `[line][depth]` sources at far depths.
         lens: `[w, n]` participation of the plain lens at the near depths.
-        disc_m: `[n]` radius of the plain lens's blur disc at them, metres.
+        disc_radius_m: `[n]` radius of the plain lens's blur disc at them, metres.
         offset_m: displacement (y, x) of the image on the sensor, or None to leave it on the axis.
         colour: number of the one colour that is looked at, or None for all.
     """
@@ -43,7 +43,7 @@ class StepSources(NamedTuple):
     near: tuple[tuple[Any, ...], ...]
     far: tuple[tuple[Any, ...], ...]
     lens: Float[Array, "w n"]
-    disc_m: Float[Array, " n"]
+    disc_radius_m: Float[Array, " n"]
     offset_m: Float[Array, "2"] | None
     colour: int | None = None
 
@@ -72,7 +72,7 @@ class SourceSet(NamedTuple):
         near: as in `StepSources`.
         far: as there.
         lens: as there.
-        disc_m: as there.
+        disc_radius_m: as there.
         displacement_m: largest displacement of the image, metres or 0.
         whole: whether every step looks at all depths.
         in_turn: whether a step looks at one colour, the next step at the next.
@@ -81,7 +81,7 @@ class SourceSet(NamedTuple):
     near: tuple[tuple[Any, ...], ...]
     far: tuple[tuple[Any, ...], ...]
     lens: Float[np.ndarray, "w n"]
-    disc_m: Float[np.ndarray, " n"]
+    disc_radius_m: Float[np.ndarray, " n"]
     displacement_m: float
     whole: bool = False
     in_turn: bool = False
@@ -121,8 +121,8 @@ class SourceSet(NamedTuple):
             tuple(tuple(line[i] for i in chosen) for line in sources)
             for sources, chosen in ((self.near, near), (self.far, far))
         )
-        lens, disc_m = jnp.asarray(self.lens[:, near]), jnp.asarray(self.disc_m[near])
-        return StepSources(near_sources, far_sources, lens, disc_m, offset_m, colour)
+        lens, disc_radius_m = jnp.asarray(self.lens[:, near]), jnp.asarray(self.disc_radius_m[near])
+        return StepSources(near_sources, far_sources, lens, disc_radius_m, offset_m, colour)
 
 
 def problem_of(
@@ -141,11 +141,11 @@ def problem_of(
     if spec.scene.near_m:
         bank = psf(HeightOptic.of(camera), depths=spec.scene.near_m)
         lens = np.asarray(participation(jnp.asarray(bank.energy)))
-    disc_m = disc_radii_m(camera, spec.scene.near_m)
+    disc_radius_m = disc_radii_m(camera, spec.scene.near_m)
     whole = any(objective.compares for objective in spec.objectives)
     in_turn = spec.optimize.colours == "in_turn"
     displacement_m = camera.pixel_m / 2 if _is_sparse(spec) else 0.0
-    return problem, SourceSet(near, far, lens, disc_m, displacement_m, whole, in_turn)
+    return problem, SourceSet(near, far, lens, disc_radius_m, displacement_m, whole, in_turn)
 
 
 def _is_sparse(spec: Spec) -> bool:
@@ -224,7 +224,7 @@ def _view(images: Images, camera: Camera, look: StepSources) -> PsfSet:
         return jnp.stack(depths, 1) if depths else jnp.zeros((len(camera.colours), 0, camera.window, camera.window))
 
     near, far = images
-    return PsfSet(bank(near), bank(far), lens, look.disc_m, camera)
+    return PsfSet(bank(near), bank(far), lens, look.disc_radius_m, camera)
 
 
 def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:

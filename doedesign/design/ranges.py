@@ -102,8 +102,8 @@ class SourceRange:
         if len(near):
             at, nodes = np.log(1 / np.asarray(near)), np.log(self.nodes_per_m)
             lens = np.array([np.exp(np.interp(at, nodes, np.log(row))) for row in self.lens], np.float32)
-        disc_m = jnp.asarray(disc_radii_m(problem.camera, near))
-        return listed._replace(near=near_sources, far=far_sources, lens=jnp.asarray(lens), disc_m=disc_m)
+        disc_radius_m = jnp.asarray(disc_radii_m(problem.camera, near))
+        return listed._replace(near=near_sources, far=far_sources, lens=jnp.asarray(lens), disc_radius_m=disc_radius_m)
 
 
 def _depth_m(per_m: float) -> float:

@@ -348,8 +348,8 @@ def three_colours(*objectives: str) -> tuple[tuple[Any, ...], PsfSet, np.ndarray
 
     camera, rng = camera_from_spec(spec), np.random.default_rng(3)
     near, far = rng.uniform(0, 1, (2, 3, 2, camera.window, camera.window)).astype(np.float32) / camera.window**2
-    disc_m = jnp.asarray(disc_radii_m(camera, spec.scene.near_m))
-    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.full((3, 2), 1e-6), disc_m, camera)
+    disc_radius_m = jnp.asarray(disc_radii_m(camera, spec.scene.near_m))
+    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.full((3, 2), 1e-6), disc_radius_m, camera)
     return terms_from_spec(spec, camera, {}), psfs, near, far
 
 

@@ -268,6 +268,8 @@ def test_the_plain_lens_is_known_between_the_listed_depths(spec: Path) -> None:
         due = psf(HeightOptic.of(problem.camera), depths=places.near_m)
         # Interpolation between 9 depths whose blur differs by a factor of 4.
         assert np.asarray(look.lens) == pytest.approx(np.asarray(participation(jnp.asarray(due.energy))), rel=0.02)
+        blurred_m = problem.camera.defocus_radius_m(places.near_m[0]) + problem.camera.pixel_m
+        assert np.asarray(look.disc_radius_m) == pytest.approx(blurred_m, rel=1e-6)  # single precision
 
 
 def test_listed_sources_on_the_axis_are_those_of_other_steps(spec: Path) -> None:

@@ -11,8 +11,8 @@ from doedesign.design.problem import SourceSet
 NEAR: Any = tuple(tuple(np.float32(10 * line + depth) for depth in range(3)) for line in range(2))
 FAR: Any = tuple(tuple(np.float32(100 + 10 * line + depth) for depth in range(2)) for line in range(2))
 LENS = np.arange(6, dtype=np.float32).reshape(2, 3)
-DISC_M = np.array([3e-4, 2e-4, 1e-4], np.float32)
-SOURCES = SourceSet(NEAR, FAR, LENS, DISC_M, 1e-6)
+DISC_RADIUS_M = np.array([3e-4, 2e-4, 1e-4], np.float32)
+SOURCES = SourceSet(NEAR, FAR, LENS, DISC_RADIUS_M, 1e-6)
 
 
 def test_the_first_look_is_at_the_first_depths_on_the_axis():
@@ -20,7 +20,7 @@ def test_the_first_look_is_at_the_first_depths_on_the_axis():
     assert found.near == ((0.0,), (10.0,))
     assert found.far == ((100.0,), (110.0,))
     assert np.asarray(found.lens).tolist() == [[0.0], [3.0]]
-    assert np.asarray(found.disc_m).tolist() == DISC_M[:1].tolist()
+    assert np.asarray(found.disc_radius_m).tolist() == DISC_RADIUS_M[:1].tolist()
     assert found.offset_m is None
 
 
@@ -32,7 +32,7 @@ def test_every_depth_is_seen_equally_often_by_all_lines():
         assert look.near[1][0] == look.near[0][0] + 10
         assert look.far[1][0] == look.far[0][0] + 10
         assert np.asarray(look.lens)[:, 0].tolist() == LENS[:, int(look.near[0][0])].tolist()
-        assert np.asarray(look.disc_m).tolist() == [DISC_M[int(look.near[0][0])]]
+        assert np.asarray(look.disc_radius_m).tolist() == [DISC_RADIUS_M[int(look.near[0][0])]]
 
 
 def test_a_step_is_the_same_again_and_others_differ():
@@ -57,7 +57,7 @@ def test_where_depths_are_compared_a_step_looks_at_all_of_them():
 
 
 def test_without_near_depths_or_displacement():
-    found = SourceSet(((), ()), FAR, LENS[:, :0], DISC_M[:0], 0.0)
+    found = SourceSet(((), ()), FAR, LENS[:, :0], DISC_RADIUS_M[:0], 0.0)
     for look in (found.first_look(), found.look(0, 7)):
         assert look.near == ((), ())
         assert look.offset_m is None

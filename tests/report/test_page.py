@@ -18,10 +18,11 @@ from doedesign.report.page.compare import compared
 from doedesign.report.page.files import open_files, safe_json
 from doedesign.report.page.gather import gather
 from doedesign.report.page.numbers import LABELS, SHARES
-from doedesign.report.page.reached import reached_section
+from doedesign.report.page.reached import asked_block, reached_section
 from doedesign.report.page.write import watch_report
 from doedesign.runs.folder import LEVEL_MAP, load_checkpoint, open_run
 from doedesign.runs.results import results_folder
+from doedesign.spec.models import ObjectiveSpec
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes
 from fab.level_map import read_level_map
@@ -126,6 +127,26 @@ def test_what_was_asked_stands_beside_what_was_reached(run: Path):
     assert (fabricated.low, fabricated.value, fabricated.high) == (0.86, 0.95, 0.985)
     write_study(run, STUDY | {"plates": PLATES | {"yield": None}})
     assert "No limits were given" in blocks(gather(run), BarBlock)[-1].note
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity", "label"),
+    [
+        ("ring_to_disc", "ring_to_disc", "ring:disc of near light"),
+        ("window_share", "throughput", "throughput, light in the window"),
+    ],
+)
+def test_what_an_objective_keeps_from_below_is_marked(run: Path, name: str, quantity: str, label: str):
+    """Met where every colour and depth reaches it."""
+    files, metrics = open_files(run), json.loads((run / "metrics.json").read_text())
+    least = min(row[quantity] for row in metrics["psf"] if row.get(quantity) is not None)
+    for share, state in ((0.9, "met"), (1.1, "missed")):
+        asked = ObjectiveSpec(name=name, options={"least": share * least})
+        objectives = (*files.spec.objectives, asked)
+        block = asked_block(files._replace(spec=files.spec.model_copy(update={"objectives": objectives})), metrics)
+        assert block is not None
+        bar = next(bar for bar in block.bars if bar.label == label)
+        assert (bar.mark, bar.state) == (pytest.approx(share * least), state)
 
 
 @pytest.mark.parametrize(
