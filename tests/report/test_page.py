@@ -141,7 +141,7 @@ def test_what_an_objective_keeps_from_below_is_marked(run: Path, name: str, quan
     files, metrics = open_files(run), json.loads((run / "metrics.json").read_text())
     least = min(row[quantity] for row in metrics["psf"] if row.get(quantity) is not None)
     for share, state in ((0.9, "met"), (1.1, "missed")):
-        asked = ObjectiveSpec(name=name, options={"least": share * least})
+        asked = ObjectiveSpec.model_validate({"name": name, "options": {"least": share * least}})
         objectives = (*files.spec.objectives, asked)
         block = asked_block(files._replace(spec=files.spec.model_copy(update={"objectives": objectives})), metrics)
         assert block is not None
