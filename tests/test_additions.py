@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.study
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
@@ -32,7 +32,7 @@ PLACES = {
         ("fab/solids/profile_file.py", "{}"),
         ("fab/solids/write.py", "KINDS: tuple[ModelKind, ...] = (\n{}"),
     ],
-    "A column of the metrics": [("sim/metrics.py", "MappingProxyType(\n    {{\n{}")],
+    "A column of the metrics": [("sim/metrics/table.py", "MappingProxyType(\n    {{\n{}")],
 }
 # Names that the tables list beside what the blocks say.
 LISTED = [

@@ -10,7 +10,6 @@ from fab.grid import Grid
 from sim.camera import Colour
 from sim.metrics import (
     MetricInputs,
-    _band_energy,
     airy_radius_m,
     disc_weights,
     encircled_energy,
@@ -25,6 +24,7 @@ from sim.metrics import (
     strehl,
     zeroth_order,
 )
+from sim.metrics.budget import _band_energy
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 
