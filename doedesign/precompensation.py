@@ -8,7 +8,6 @@ loss of a spec's objectives may be less than the design's own, with another ligh
 request alone. The plate looked at is the one that the process makes with every error at its mean.
 """
 
-import contextlib
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +38,7 @@ from doedesign.runs.folder import (
     finish_run,
     input_digests,
     inputs_of_run,
+    is_finished,
     named,
     open_run,
 )
@@ -272,11 +272,12 @@ def _finished(folder: Path, inputs: dict[str, str], *, overwrite: bool) -> Desig
     # The spec of the new run is known after the search alone.
     before = inputs_of_run(folder)
     if before == inputs:
-        with contextlib.suppress(InputError):  # not finished
-            found = open_design(folder, False)
-            log.info(f"{folder} already holds this pre-compensation")
-            return found
-    elif before is not None and not overwrite:
+        if not is_finished(folder):
+            return None
+        found = open_design(folder, False)
+        log.info(f"{folder} already holds this pre-compensation")
+        return found
+    if before is not None and not overwrite:
         cure = "Choose another output folder, or give `overwrite` to remove that run and all that was made of it."
         raise InputError(str(folder), "the folder must belong to this pre-compensation", "another run", cure)
     return None

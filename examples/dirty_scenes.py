@@ -85,8 +85,7 @@ def dirty_scenes(
     errors = DirtErrors()
     for number in range(count):
         rng = np.random.default_rng((*stream, number))
-        picture = pictures.get(number % len(pictures))
-        assert picture is not None
+        _, picture = pictures.following(number)
         place = (rng.uniform(), rng.uniform())
         background = linear_light(crop(picture, (side, side), place, bool(rng.integers(2))))
         drawn = kind.draw(rng, view, dark)

@@ -29,8 +29,9 @@ from doedesign.design.objectives import terms_from_spec
 from doedesign.design.problem import judge_height, problem_of
 from doedesign.design.starts import Ridge, StartSetup, grating, ring_period_m
 from doedesign.optimization import optimize
+from doedesign.runs.journal import study_folder
 from doedesign.search import least
-from doedesign.spec import Spec, load_spec
+from doedesign.spec import Spec, load_spec, spec_digest
 from fab.errors import InputError
 from fab.figure import FAINT, INK, SERIES, panels, save
 from fab.files import csv_table, write_atomic
@@ -215,8 +216,13 @@ def plot(found: Sequence[Plate], curve: tuple[np.ndarray, np.ndarray], title: st
 
 def run(path: Path, spots: Sequence[float], evaluations: int, out: Path) -> list[Plate]:
     """Design, judge, and write the table and the picture."""
-    out.mkdir(parents=True, exist_ok=True)
-    spec, found = load_spec(path), kept(out / TABLE)
+    spec = load_spec(path)
+    with study_folder(out, {"spec_sha256": spec_digest(spec), "evaluations": evaluations}):
+        return _run(path, spec, spots, evaluations, out)
+
+
+def _run(path: Path, spec: Spec, spots: Sequence[float], evaluations: int, out: Path) -> list[Plate]:
+    found = kept(out / TABLE)
     camera, near = camera_from_spec(spec), len(spec.scene.near_m)
     lens = psf(HeightOptic.of(camera), depths=(*spec.scene.near_m, *spec.scene.far_m))
     banks: dict[str, PsfBank] = {}

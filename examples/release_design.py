@@ -35,6 +35,7 @@ from fab.units import format_length
 from sim.metrics import METRICS
 
 TOLERANCE = "tolerance.json"
+PROCESS = "contact_aligner"
 COPIED = ("spec.toml", LEVEL_MAP, "metrics.json")
 # Of a spec without limits of its own: two thirds of a spot of 0.3, and most of what is near spread about its disc.
 LIMITS = ("far_spot >= 20 %", "ring_to_disc >= 0.8")
@@ -42,7 +43,7 @@ SHOWN = ("far_spot", "zeroth_order", "ring_to_disc", "outside_window", "strehl")
 
 
 def release(
-    run: Path, out: Path, spec: str, draws: int = 64, process: str = "contact_aligner", workers: int | None = None
+    run: Path, out: Path, spec: str, draws: int = 64, process: str = PROCESS, workers: int | None = None
 ) -> None:
     """Write the folder.
 
@@ -71,7 +72,7 @@ def release(
     write_atomic(out / TOLERANCE, canonical_json(record))
     digest = read_level_map(out / LEVEL_MAP).digest
     manifest = read_json(run / MANIFEST_NAME)
-    commands = commands_of(f"runs/{out.name}", spec, manifest["overrides"], draws)
+    commands = commands_of(f"runs/{out.name}", spec, manifest["overrides"], draws, process)
     rows = read_json(out / "metrics.json")["psf"]
     text = words(design.name, spec, commands, digest, rows, record, str(found.yield_))
     write_atomic(out / "README.md", text.encode())
@@ -81,12 +82,13 @@ def release(
     write_atomic(out / MANIFEST_NAME, canonical_json(said))
 
 
-def commands_of(run: str, spec: str, overrides: Sequence[str], draws: int) -> str:
+def commands_of(run: str, spec: str, overrides: Sequence[str], draws: int, process: str) -> str:
     """The commands that make a folder again, indented."""
+    other = "" if process == PROCESS else f" --process {process}"
     changes = "".join(f" \\\n        --set {quoted(one)}" for one in overrides)
     return (
         f"    doedesign optimize {spec} --out {run}{changes}\n"
-        f"    python examples/release_design.py {run} --draws {draws} --spec {spec}"
+        f"    python examples/release_design.py {run} --draws {draws}{other} --spec {spec}"
     )
 
 
@@ -118,7 +120,7 @@ def words(
                     cells = [f"{row[key]:.3f} ({row['concentration_bound']:.3f})" for row in of]
                 drawn.append(f"| {label} {where} | " + " | ".join(cells) + " |")
     plates = [
-        f"| worst colour and depth | {' | '.join(('as drawn', 'mean', '5 %', 'median', '95 %'))} |",
+        f"| worst colour, nearest and farthest depth | {' | '.join(('as drawn', 'mean', '5 %', 'median', '95 %'))} |",
         "|---" * 6 + "|",
     ]
     statistics = {row["quantity"]: row for row in record["plates"]["statistics"] if row["colour"] is None}
@@ -150,7 +152,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", type=Path, help="folder of a finished run")
     parser.add_argument("--draws", type=int, default=64)
-    parser.add_argument("--process", default="contact_aligner")
+    parser.add_argument("--process", default=PROCESS)
     parser.add_argument("--spec", help="the spec, for the words; examples/NAME.toml by default")
     parser.add_argument("--out", type=Path, help="masks/ and the name of the run's folder by default")
     given = parser.parse_args()

@@ -34,7 +34,9 @@ from doedesign.cli import exit_code
 from doedesign.hdr.capture import LampCamera, PlateSeries
 from doedesign.hdr.scenes import Lamps, LampScenes
 from doedesign.hdr.study import CASES, LampCase, LampRow, LampStudy
+from doedesign.runs.journal import study_folder
 from doedesign.runs.level_maps import open_design
+from doedesign.spec import spec_digest
 from doedesign.training.scores import paired_difference
 from fab.files import canonical_json, csv_table, write_atomic
 from sim.light import srgb_from_linear
@@ -69,6 +71,14 @@ def chequerboard(height_m: np.ndarray, cells_px: int) -> np.ndarray:
     """Heights of a chequerboard of a design's highest step, with squares of so many of its pixels."""
     y, x = (np.arange(n) // cells_px % 2 for n in height_m.shape)
     return float(height_m.max()) * (y[:, None] ^ x)
+
+
+def asked_of(run: Path, study: LampStudy, **more: Any) -> dict[str, Any]:
+    """What the rows of a study depend on, for its folder."""
+    design, scenes = open_design(run), study.scenes
+    assert design.spec is not None
+    own = {"level_map": design.level_map.digest, "spec_sha256": spec_digest(design.spec), "process": PROCESS}
+    return {**own, "pictures_sha256": scenes.pictures.digest(), "seed": scenes.seed, **more}
 
 
 def _plate(design: Any, seed: int, draw: int) -> Any:
@@ -242,12 +252,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cases = [case for case in CASES if given.case is None or case.name in given.case]
         boards = {case.cells_px for case in cases if case.cells_px is not None}
         study = study_of(given.run, given.images, given.seed, cells_px=sorted(boards))
-        rows = measure(study, out, given.scenes, given.others, cases)
-        found = summary(rows)
-        said = {"cases": found, "between_cases": between_cases(rows), "light": light_of_plate(study)}
-        write_atomic(out / "summary.json", canonical_json(said))
-        if CASES[0] in cases:
-            draw_scenes(study, out / "scenes.png", range(min(_SHOWN, given.scenes)))
+        with study_folder(out, asked_of(given.run, study)):
+            rows = measure(study, out, given.scenes, given.others, cases)
+            found = summary(rows)
+            said = {"cases": found, "between_cases": between_cases(rows), "light": light_of_plate(study)}
+            write_atomic(out / "summary.json", canonical_json(said))
+            if CASES[0] in cases:
+                draw_scenes(study, out / "scenes.png", range(min(_SHOWN, given.scenes)))
         print(table(found))
 
     return exit_code(work)

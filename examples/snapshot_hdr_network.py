@@ -21,7 +21,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from snapshot_hdr import PARTS, PROCESS, SEED, gained, study_of, summary, table  # pyright: ignore[reportMissingImports]
+from snapshot_hdr import PARTS, PROCESS, SEED, asked_of, gained, study_of, summary, table  # pyright: ignore[reportMissingImports]
 from snapshot_hdr import read_rows as rows_of  # pyright: ignore[reportMissingImports]
 
 from doedesign.capture.images import Pictures, picture_files
@@ -33,6 +33,7 @@ from doedesign.hdr.scenes import Lamps, LampScenes
 from doedesign.hdr.scores import judged_light
 from doedesign.hdr.solver import LampSolver
 from doedesign.hdr.study import CASES, LampRow, LampStudy
+from doedesign.runs.journal import study_folder
 from doedesign.runs.level_maps import open_design
 from fab.files import canonical_json, csv_table, write_atomic
 
@@ -67,14 +68,15 @@ def learnt(study: LampStudy, run: Path, pictures: Pictures, out: Path, how: Lamp
         if steps % 20 == 0:
             print(f"{camera}, step {steps} of {how.steps}: loss {loss:.3f}", file=sys.stderr, flush=True)
 
-    names = [path.name for path in pictures.files]
+    settings = {"process": PROCESS, "seed": seed, "frame_px": _FRAME_PX, "level_map": design.level_map.digest}
+    settings |= {"pictures_sha256": pictures.digest()}
     return {
         camera: trained_lamp_network(
             out / camera.replace(" ", "_"),
             partial(examples, camera),  # pyright: ignore[reportArgumentType]
             study.known(camera),
             how,
-            {"camera": camera, "process": PROCESS, "seed": seed, "frame_px": _FRAME_PX, "pictures": names},
+            {"camera": camera, **settings},
             partial(told, camera),
         )
         for camera in CAMERAS
@@ -124,17 +126,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenes", type=int, default=50, help="scenes and plates to judge on")
     parser.add_argument("--examples", type=int, default=LampTraining.examples, help="scenes to train on")
     parser.add_argument("--steps", type=int, default=LampTraining.steps)
-    parser.add_argument("--out", type=Path, help="RUN/hdr by default")
+    parser.add_argument("--out", type=Path, help="RUN/hdr_network by default")
     given = parser.parse_args(arguments)
 
     def work() -> None:
-        out = given.out or given.run / "hdr"
+        out = given.out or given.run / "hdr_network"
         study = replace(study_of(given.run, given.images, SEED), solver=QUICK)
         pictures = Pictures(picture_files(given.training), most_px=_SHORTER_SIDE)
         how = replace(LampTraining(), steps=given.steps, examples=given.examples)
-        rows = measure(study, learnt(study, given.run, pictures, out, how), out, given.scenes)
-        found = summary(rows)
-        write_atomic(out / "network.json", canonical_json({"cases": found, "over_solver": over_solver(rows)}))
+        asked = asked_of(given.run, study, training_sha256=pictures.digest(), steps=how.steps, examples=how.examples)
+        with study_folder(out, asked):
+            rows = measure(study, learnt(study, given.run, pictures, out, how), out, given.scenes)
+            found = summary(rows)
+            write_atomic(out / "network.json", canonical_json({"cases": found, "over_solver": over_solver(rows)}))
         print(table(found))
 
     return exit_code(work)

@@ -28,7 +28,7 @@ import io
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,9 +50,10 @@ from doedesign.design.objectives import PsfSet, filtered_error
 from doedesign.optimization import optimize
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.weights import camera_facts, read_network, write_network
+from doedesign.runs.journal import study_folder
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
-from doedesign.spec import Spec, load_spec
+from doedesign.spec import Spec, load_spec, spec_digest
 from doedesign.spec.training import TrainSpec
 from doedesign.training.loss import adam_step, losses
 from doedesign.training.scores import mean_and_interval, paired_difference, psnr
@@ -120,6 +121,11 @@ def scenes_of(pictures: Pictures, plan: Plan, count: int, stream: int) -> list[D
     spec = load_spec(SPEC)
     kind = obstruction_from_spec(spec, str(SPEC))
     return list(dirty_scenes(pictures, camera_from_spec(spec), kind, plan.size, count, (plan.seed, stream)))
+
+
+def noise_key(plan: Plan, stream: int, number: int) -> Any:
+    """Of the noise of a training step or a judged scene."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(plan.seed), stream), number)
 
 
 def camera_of(kind: CameraKind) -> tuple[Camera, Spec]:
@@ -264,7 +270,7 @@ def trained(bench: Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path
     with meter(f"training, {bench.kind.name}", plan.steps, 0) as progress:
         for step in range(plan.steps):
             chosen = rng.integers(len(scenes), size=plan.batch)
-            keys = jax.random.split(jax.random.key(1000 + step), plan.batch)
+            keys = jax.random.split(noise_key(plan, 0, step), plan.batch)
             seen, wanted, covered = [], [], []
             for k, key in zip(chosen, keys, strict=True):
                 scene = scenes[k]
@@ -341,7 +347,7 @@ def judge(
             for depth in JUDGED_M:
                 light = light_of(scene, *at.at(depth), plan.size)
                 for brightness in lights:
-                    raw = taken(light, bench.sensor(brightness), jax.random.fold_in(jax.random.key(77), number))
+                    raw = taken(light, bench.sensor(brightness), noise_key(plan, 1, number))
                     seen = bench.corrected(raw, scene, depth)
                     found = {"network": np.asarray(_look(network, seen[None], far))[0], "filter": filtered(seen, bench)}
                     for way, picture in found.items():
@@ -461,11 +467,16 @@ def draw(path: Path, scenes: Sequence[DirtyScene], shown: Mapping[str, Mapping[A
 
 def run(out: Path, plan: Plan, images: Sequence[Path], judged: Sequence[Path]) -> dict[str, Any]:
     """Design, train and judge; return the summary."""
-    out.mkdir(parents=True, exist_ok=True)
+    pools = [Pictures(tuple(files), 512) for files in (images, judged)]
+    asked = {"spec_sha256": spec_digest(load_spec(SPEC)), "plan": asdict(plan)}
+    with study_folder(out, {**asked, "pictures_sha256": [pool.digest() for pool in pools]}):
+        return _run(out, plan, pools)
+
+
+def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
     optimize(SPEC, out / "design")
     design = open_design(out / "design")
     classic_plates(design, out)
-    pools = [Pictures(tuple(files), 512) for files in (images, judged)]
     training = scenes_of(pools[0], plan, plan.scenes, 0)
     seen = scenes_of(pools[1], plan, plan.judged, 1)
     rows: list[Judged] = []

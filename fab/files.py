@@ -100,18 +100,19 @@ def _made_file(path: Path) -> tuple[Path, int]:
 
 
 def _made_folder(path: Path, what: str) -> tuple[Path, int]:
-    name = tempfile.mkdtemp(prefix=f".{path.name}.{what}.", dir=path.parent)
-    return Path(name), os.open(name, os.O_RDONLY)
+    while True:
+        name = tempfile.mkdtemp(prefix=f".{path.name}.{what}.", dir=path.parent)
+        with contextlib.suppress(FileNotFoundError):  # cleared by another process before it was opened
+            return Path(name), os.open(name, os.O_RDONLY)
 
 
 def _locked(make: Callable[[], tuple[Path, int]]) -> tuple[Path, int]:
     """Make a temporary file or folder, and lock it until its handle is closed: its process lives."""
     while True:
-        with contextlib.suppress(FileNotFoundError):  # cleared by another process before it was locked
-            path, handle = make()
-            if lock(handle) is not False and path.exists():
-                return path, handle
-            os.close(handle)
+        path, handle = make()
+        if lock(handle) is not False and path.exists():
+            return path, handle
+        os.close(handle)  # cleared by another process before it was locked
 
 
 def lock(handle: int) -> bool | None:

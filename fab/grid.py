@@ -30,6 +30,9 @@ def moved_edges(edges: NDArray[Any], move: Any) -> tuple[NDArray[Any], NDArray[n
     return moved, first, end
 
 
+_PITCHES_M = 1e-12, 1e3  # far beyond what is drawn, and squares of lengths stay numbers
+
+
 @dataclass(frozen=True)
 class Grid:
     """A raster of square pixels centred on the optical axis.
@@ -42,7 +45,7 @@ class Grid:
         pitch_m: edge of one pixel, metres.
 
     Raises:
-        InputError: a count below one, or a pitch that is not positive and finite.
+        InputError: a count below one, or a pitch that is not from 1 pm to 1 km.
     """
 
     shape: tuple[int, int]
@@ -52,8 +55,8 @@ class Grid:
         ny, nx = self.shape
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
-        if not 0 < self.pitch_m < float("inf"):
-            raise InputError("grid: pitch", "must be positive and finite", self.pitch_m, "Give the pixel pitch.")
+        if not _PITCHES_M[0] <= self.pitch_m <= _PITCHES_M[1]:
+            raise InputError("grid: pitch", "must lie between 1 pm and 1 km", self.pitch_m, "Give the pixel pitch.")
 
     @property
     def extent_m(self) -> tuple[float, float]:

@@ -28,6 +28,8 @@ FEWEST, MOST = 2, 64
 _ROWS = 256
 # Depths that agree so closely with 2^k steps are meant to be 2^k steps.
 _SAME = 1e-9
+# Far beyond what is made, so that sums of depths stay numbers.
+_LONGEST_M = 1e3
 # Heights of two levels must differ by this part of a step. No process tells less apart, and single precision keeps a
 # height to 1e-5 of a step, so that a stored height always says which level it is.
 _APART = 1e-3
@@ -44,8 +46,8 @@ class Levels:
         depths_m: how deep each mask etches, metres, first mask first; ``2**k * step_m`` where none are given.
 
     Raises:
-        InputError: a count that is not a whole number from 2 to 64, a step that is not positive, or depths that are not
-            one per mask, not positive, or leave two levels at one height.
+        InputError: a count that is not a whole number from 2 to 64, a step or a depth that is not positive or longer
+            than 1 km, or depths that are not one per mask or leave two levels at one height.
     """
 
     count: int
@@ -61,16 +63,19 @@ class Levels:
             cure = "For example 6 or 16; powers of two use every set of masks."
             raise InputError("levels", f"must be a whole number from {FEWEST} to {MOST}", self.count, cure)
         object.__setattr__(self, "count", count)
-        if not 0 < self.step_m < math.inf:
-            raise InputError("level step", "must be positive and finite", self.step_m, 'Give a step such as "75 nm".')
+        if not 0 < self.step_m <= _LONGEST_M:
+            raise InputError(
+                "level step", "must be positive and at most 1 km", self.step_m, 'Give one such as "75 nm".'
+            )
         binary = tuple(2**bit * self.step_m for bit in range(self.bits))
         depths = tuple(float(depth) for depth in self.depths_m)
         if depths and len(depths) != self.bits:
             rule = f"{self.count} levels must have {self.bits} etches"
             raise InputError("etch depths", rule, f"{len(depths)} depths", "Give one depth per mask, first mask first.")
         for depth in depths:
-            if not 0 < depth < math.inf:
-                raise InputError("etch depths", "must be positive and finite", depth, 'Give depths such as "75 nm".')
+            if not 0 < depth <= _LONGEST_M:
+                cure = 'Give depths such as "75 nm".'
+                raise InputError("etch depths", "must be positive and at most 1 km", depth, cure)
         even = all(math.isclose(depth, due, rel_tol=_SAME) for depth, due in zip(depths, binary, strict=False))
         object.__setattr__(self, "depths_m", binary if even else depths)
         if not even:
@@ -89,7 +94,7 @@ class Levels:
             raise InputError("etch depths", "no two levels may have the same height", got, cure)
 
     def _masks_in_words(self, level: int) -> str:
-        masks = [str(bit) for bit in range(self.bits) if self.count - 1 - level >> bit & 1]
+        masks = [f"{bit + 1} (bit {bit})" for bit in range(self.bits) if self.count - 1 - level >> bit & 1]
         return f"mask{'s' * (len(masks) > 1)} {' + '.join(masks)}" if masks else "no mask"
 
     @property

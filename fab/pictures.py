@@ -49,7 +49,8 @@ def decoding(
     except Exception as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise explain_os_error(error, path) from error
-        text = re.sub(rf"'{re.escape(str(path))}'|<_io\.\w+ object at \w+>", "it", str(error))
+        named = rf"'{re.escape(str(path))}'|<_io\.\w+ object at \w+>"
+        text = re.sub(named, lambda _: Path(path).name, str(error))
         got = " ".join(text.split()) or type(error).__name__
         raise InputError(str(path), rule, f'"{got}"', cure) from error
 

@@ -10,7 +10,6 @@ edges of two masks coincide, as all do without errors, slivers open whichever wa
 there and a derivative to one side says nothing of the other. The exact gradient serves the last polish of a fit.
 """
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from jaxtyping import Float
 from doedesign.calibration.forward_model import DoeImages, ForwardModel, Motion
 from doedesign.calibration.target import Image, Match, Target, match
 from doedesign.calibration.unknowns import Unknowns
+from sim.threads import cores
 
 _SHIFT_SIGMA = 2.0  # pixels by which an image may lie off where it was found
 WIDEST_STEP, _NARROWEST_STEP = 0.05, 0.004  # scores, for central differences
@@ -171,7 +171,7 @@ class Evaluation(NamedTuple):
                     column[k] = (high - low) / width
 
         # A DOE keeps one core busy.
-        with ThreadPoolExecutor(min(len(scores), os.cpu_count() or 1, _MOST_THREADS)) as pool:
+        with ThreadPoolExecutor(min(len(scores), cores(), _MOST_THREADS)) as pool:
             list(pool.map(difference, range(len(scores))))
         return Jacobian(columns, zeroth)
 

@@ -17,6 +17,7 @@ A stopped simulation goes on with the item it stopped at; the same seed gives th
 
 import json
 import logging
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -48,6 +49,7 @@ from sim.surface import as_fabricated
 
 FORMAT = "doedesign simulation 1"
 _SEAL = "item_sha256"
+_ITEM = re.compile(r"\d{4,}_")  # begins the name of an item's folder
 
 _USUAL_COUNT = 6
 _log = logging.getLogger("doedesign")
@@ -191,20 +193,21 @@ def _require_own(folder: Path, digest: str) -> None:
             rule = "a simulation needs a new or empty folder, or its own"
             raise InputError(str(folder), rule, "other content", "Choose another output folder.")
         return
-    if {path.name for path in folder.iterdir()} == {MANIFEST_NAME}:
-        return  # begun and nothing more: there is nothing to lose, whatever it was
     found = read_json(folder / MANIFEST_NAME)
-    if found.get("format") != FORMAT or found.get("settings_sha256") != digest:
+    begun = {path.name for path in folder.iterdir()} == {MANIFEST_NAME}  # and nothing more: there is nothing to lose
+    if found.get("format") != FORMAT or (found.get("settings_sha256") != digest and not begun):
         rule = "the folder must belong to this simulation"
         got = "one with another run, seed, obstruction, model, sensor or other pictures"
         raise InputError(str(folder), rule, got, "Choose another output folder, or remove that one.")
 
 
 def _finished(folder: Path, digest: str) -> dict[int, str]:
-    """Items that are there and whole, by number."""
+    """Items that are there and whole, by number; damaged ones are removed, and what else lies there stays."""
     found = {}
     for path in sorted(folder.glob(f"*/{MANIFEST_NAME}")):
         item = read_json(path)
+        if item.get("format") != FORMAT or not _ITEM.match(path.parent.name):
+            continue
         if item == _sealed(item) and item.get("settings_sha256") == digest and _files_are_whole(path.parent, item):
             found[item["number"]] = path.parent.name
         else:

@@ -10,7 +10,7 @@ is shrunk once, on reading, so that its shorter side has `most_px` pixels.
 
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fab.errors import InputError
-from fab.files import canonical_json, explain_os_error, os_errors_explained, sha256_bytes
+from fab.files import canonical_json, os_errors_explained, sha256_bytes, sha256_file
 from fab.pictures import read_display
 
 PICTURE_FILES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
@@ -91,7 +91,7 @@ class Pictures:
         return len(self.files)
 
     def get(self, index: int) -> Picture | None:
-        """One picture, or None if its file has to be skipped; InputError if every file has to be."""
+        """One picture, or None if its file has to be skipped."""
         path = self.files[index]
         with self._lock:
             alone = self._busy.setdefault(path, threading.Lock())
@@ -112,14 +112,32 @@ class Pictures:
                     self._bytes += picture.nbytes
             return picture
 
+    def first_whole(self, indices: Iterable[int]) -> tuple[str, Picture]:
+        """File name and pixels of the first of some pictures whose file can be used.
+
+        Raises:
+            InputError: none of them can.
+        """
+        indices = tuple(indices)
+        for index in indices:
+            if (picture := self.get(index)) is not None:
+                return self.files[index].name, picture
+        broken = [self.files[index] for index in sorted(indices)]
+        rule, got = "at least one picture must be whole", f"only broken ones: {_names(broken)}"
+        raise InputError(str(broken[0].parent), rule, got, "Give other pictures.")
+
+    def following(self, number: int) -> tuple[str, Picture]:
+        """The picture of a number, which goes round the folder, or the first after it whose file can be used.
+
+        Raises:
+            InputError: no file can be used.
+        """
+        return self.first_whole((number + step) % len(self) for step in range(len(self)))
+
     def _skip(self, path: Path, error: InputError) -> None:
         with self._lock:
             self.skipped[path] = f"{error.rule}, but got {error.got}"
-            none_left = len(self.skipped) == len(self.files)
         _log.warning("skipped %s: %s", path, self.skipped[path])
-        if none_left:
-            rule, got = "at least one picture must be whole", f"only broken ones: {_names(self.files)}"
-            raise InputError(str(path.parent), rule, got, "Give other pictures.")
 
     def skips(self) -> str:
         """One sentence on the files that were skipped; empty if none was."""
@@ -128,11 +146,8 @@ class Pictures:
         return f"{len(self.skipped)} of {len(self)} pictures skipped: {_names(sorted(self.skipped))}"
 
     def digest(self) -> str:
-        """SHA-256 of the files' names and sizes: equal for equal folders, whatever was decoded yet."""
-        try:
-            return sha256_bytes(canonical_json([[path.name, path.stat().st_size] for path in self.files]))
-        except OSError as error:
-            raise explain_os_error(error, str(error.filename)) from error
+        """SHA-256 of the files' names and contents: equal for equal folders, whatever was decoded yet."""
+        return sha256_bytes(canonical_json([[path.name, sha256_file(path)] for path in self.files]))
 
 
 def _names(paths: Sequence[Path]) -> str:

@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from doedesign.capture.images import Picture, Pictures, crop, linear_light, zoomed
-from fab.errors import InputError
 from sim.imaging.scene import Scene
 from sim.obstruction import CameraView, ObstructionKind
 
@@ -99,13 +98,7 @@ class SceneData:
 
     def _picture(self, epoch: int, index: int) -> tuple[str, Picture]:
         order = epoch_order(self.seed, epoch, len(self.pictures))
-        for step in range(len(order)):
-            chosen = int(order[(index + step) % len(order)])
-            picture = self.pictures.get(chosen)
-            if picture is not None:
-                return self.pictures.files[chosen].name, picture
-        folder, rule = str(self.pictures.files[0].parent), "at least one picture must be whole"
-        raise InputError(folder, rule, "none", "Give other pictures.")
+        return self.pictures.first_whole(np.roll(order, -index).tolist())
 
     def batches(self, start: int = 0, stop: int | None = None) -> AbstractContextManager[Iterator[Batch]]:
         """Open the stream, from batch number `start` to the one before `stop`, without end by default."""

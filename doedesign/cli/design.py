@@ -187,7 +187,7 @@ def masks(
         step: Height of one level, such as "75 nm"; for a bare height map.
         etch_depths: Depth of every mask where it is not 2^k steps, such as "80 nm,150 nm"; for a bare height map.
         pitch: Pixel pitch of a bare height map, such as "1.85 um".
-        scale: Height of one count of an integer map, such as "1 nm".
+        scale: Height of one count of an integer map, such as "1 nm", or of 1 in a map of floats that are not metres.
         aperture: Diameter of the relief, width and height such as "2 mm,1 mm", or a picture that is white where it is;
             the map's shorter side by default.
         on_violation: Where the process cannot print a mask: warn, fail, or fix the level map and say what it costs.
@@ -210,7 +210,17 @@ def masks(
         fixed = {"--levels": levels, "--step": step, "--etch-depths": etch_depths, "--pitch": pitch, "--scale": scale}
         fixed |= {"--aperture": aperture, "--wafer": wafer, "--terms": terms, "--probe": probe}
         _refuse_beside_as_built(fixed, "Leave it out: the order has its own.")
-        _refuse_beside_as_built({"--out": out, "--patch": patch, "--mesh-patch": mesh_patch}, "Leave it out.")
+        usual: dict[str, tuple[object, object]] = {
+            "--on-violation": (on_violation, "warn"),
+            "--plates": (plates, "gds.gz"),
+            "--mesh-cells": (mesh_cells, 200),
+            "--direct-write": (direct_write, False),
+            "--combined-gds": (combined_gds, False),
+            "--overwrite": (overwrite, False),
+        }
+        drawn = {option: None if given == default else given for option, (given, default) in usual.items()}
+        drawn |= {"--out": out, "--patch": patch, "--mesh-patch": mesh_patch}
+        _refuse_beside_as_built(drawn, "Leave it out: nothing is drawn.")
         _predict_as_built(source, as_built, order, process, json_)
         return
     if order is not None:

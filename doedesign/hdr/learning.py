@@ -130,6 +130,9 @@ def lamp_examples(
         known: `[c, v, u]` PSFs of white light as they are known.
         numbers: of the scenes; scenes without a saturated pixel are left out.
         solver: whose estimate the network goes on from.
+
+    Raises:
+        InputError: no scene has a saturated pixel.
     """
     solver = solver or LampSolver()
     views, truths, bright = [], [], []
@@ -142,6 +145,9 @@ def lamp_examples(
         views.append(viewed(capture, solver.solve(capture, known).light, known))
         truths.append(np.moveaxis(scene.light(), 0, -1))
         bright.append(np.moveaxis(saturated, 0, -1).astype(np.float32))
+    if not views:
+        cure = "Make more examples, or brighter lamps."
+        raise InputError("training.examples", "some must have saturated pixels", "none", cure)
     view = LampView(*(np.stack(each) for each in zip(*views, strict=True)))
     return LampExamples(view, np.stack(truths), np.stack(bright))
 
@@ -234,6 +240,9 @@ def trained_lamp_network(
             _refuse(folder)
         return network
     examples = _examples(folder, made, {"how": {"examples": how.examples}, **settings})
+    if len(examples.truth) < how.batch:
+        got = f"{len(examples.truth)} of {how.examples} with saturated pixels"
+        raise InputError("training.examples", "must fill a batch", got, "Make more examples, or brighter lamps.")
     veils = _veils(known, examples.truth.shape[1])
     network = LampNetwork.make(how.seed, len(known), how.width)
     state = settled(LampState(0, network, optax.scale_by_adam().init(eqx.filter(network, eqx.is_inexact_array))))

@@ -195,13 +195,10 @@ class LampScenes:
             InputError: no picture can be decoded.
         """
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
-        which, picture = number, None
-        while picture is None:
-            picture, which = self.pictures.get(which % len(self.pictures)), which + 1
+        name, picture = self.pictures.following(number)
         size = self.frame_px + 2 * self.margin_px
         place = (float(rng.uniform()), float(rng.uniform()))
         background = linear_light(crop(picture, (size, size), place)) * np.float32(rng.uniform(*self.gain))
-        name = self.pictures.files[(which - 1) % len(self.pictures)].name
         return self.lamps.draw(rng, background, self.margin_px, weights, name)
 
     def with_lamps(self, lamps: Lamps) -> "LampScenes":

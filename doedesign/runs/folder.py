@@ -267,6 +267,11 @@ def inputs_of_run(folder: Path) -> Mapping[str, str] | None:
     return _read_manifest(folder).inputs_sha256 if (folder / MANIFEST_NAME).is_file() else None
 
 
+def is_finished(folder: Path) -> bool:
+    """Whether the run in a folder is done, whole or not."""
+    return _read_manifest(folder).state == "done"
+
+
 def begin_run(run: Run) -> None:
     """Write the manifest of a claimed run that begins, its spec, and its pictures."""
     for key, name in kept_pictures(run.spec).items():

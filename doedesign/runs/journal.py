@@ -1,7 +1,7 @@
 """Finished items of a long piece of work, in memory and, where a folder is given, on disk.
 
     study.json     what is asked; only results of the same study are kept together
-    FILE           one line of JSON per finished item, in the order in which they were finished
+    FILE           one line of JSON per finished item, in the order in which they were finished, with its digest
 
 A line is on the disk before the next item is taken, so work that is killed at any moment loses nothing that was
 finished; the half of a line that a killed process left behind is cut off.
@@ -16,9 +16,44 @@ from typing import Any, Protocol
 
 from doedesign.runs.folder import alone_in
 from fab.errors import InputError
-from fab.files import canonical_json, os_errors_explained, read_bytes, read_json, write_atomic
+from fab.files import canonical_json, os_errors_explained, read_bytes, read_json, sha256_bytes, write_atomic
 
 STUDY_NAME = "study.json"
+_DIGEST = "sha256"
+
+
+@contextlib.contextmanager
+def study_folder(folder: Path, study: Mapping[str, Any]) -> Iterator[None]:
+    """Keep a folder for this process, and for the results of one study.
+
+    Args:
+        folder: the folder, made where there is none.
+        study: all that the results depend on, for JSON; kept in the folder.
+
+    Raises:
+        InputError: the folder holds another study or something else, or another process works in it.
+    """
+    with alone_in(folder):
+        _claim(folder, study)
+        yield
+
+
+def _claim(folder: Path, asked: Mapping[str, Any]) -> None:
+    path = folder / STUDY_NAME
+    # Only what compares equal after a way through the file is the same study.
+    study = json.loads(canonical_json(asked))
+    if not path.exists():
+        foreign = [p.name for p in sorted(folder.iterdir())]
+        if foreign:
+            rule, cure = "a study needs a new or empty folder, or its own", "Choose another folder."
+            raise InputError(str(folder), rule, f"other content, such as {foreign[0]!r}", cure)
+        write_atomic(path, canonical_json(study))
+        return
+    found = read_json(path)
+    different = [key for key in sorted(found.keys() | study.keys()) if found.get(key) != study.get(key)]
+    if different:
+        rule, cure = "the folder must belong to this study", "Choose another folder, or remove that study."
+        raise InputError(str(folder), rule, f"one with another {', '.join(different)}", cure)
 
 
 class Lines(Protocol):
@@ -64,8 +99,7 @@ class Journal:
         if self.folder is None or self._file is not None:
             yield  # nothing on the disk, or open already
             return
-        with alone_in(self.folder):
-            self._claim(self.folder)
+        with study_folder(self.folder, self.study):
             path = self.folder / self.lines.file
             self.finished |= _read(path, self.lines)
             with os_errors_explained(path):
@@ -82,7 +116,8 @@ class Journal:
         Raises:
             InputError: the disk is full, or refuses otherwise.
         """
-        line = json.dumps(self.lines.encode(key, found), sort_keys=True, allow_nan=False) + "\n"
+        own = self.lines.encode(key, found)
+        line = json.dumps({**own, _DIGEST: _digest(own)}, sort_keys=True, allow_nan=False) + "\n"
         if self.folder is not None and self._file is not None:
             with os_errors_explained(self.folder / self.lines.file):
                 data = line.encode()
@@ -90,24 +125,22 @@ class Journal:
                     data = data[os.write(self._file, data) :]
                 os.fsync(self._file)
         # As it would be read again.
-        self.finished |= dict([self.lines.decode(json.loads(line))])
+        self.finished |= dict([self.lines.decode(_whole(line))])
 
-    def _claim(self, folder: Path) -> None:
-        path = folder / STUDY_NAME
-        # Only what compares equal after a way through the file is the same study.
-        study = json.loads(canonical_json(self.study))
-        if not path.exists():
-            foreign = [p.name for p in sorted(folder.iterdir())]
-            if foreign:
-                rule, cure = "a study needs a new or empty folder, or its own", "Choose another folder."
-                raise InputError(str(folder), rule, f"other content, such as {foreign[0]!r}", cure)
-            write_atomic(path, canonical_json(study))
-            return
-        found = read_json(path)
-        different = [key for key in sorted(found.keys() | study.keys()) if found.get(key) != study.get(key)]
-        if different:
-            rule, cure = "the folder must belong to this study", "Choose another folder, or remove that study."
-            raise InputError(str(folder), rule, f"one with another {', '.join(different)}", cure)
+
+def _digest(line: Mapping[str, Any]) -> str:
+    return sha256_bytes(json.dumps(line, sort_keys=True, allow_nan=False).encode())[:16]
+
+
+def _whole(text: str | bytes) -> dict[str, Any]:
+    """A line as it was written; a ValueError, KeyError or TypeError for one that was changed since."""
+    line = json.loads(text)
+    if not isinstance(line, dict):
+        raise TypeError("no table")
+    told = line.pop(_DIGEST)
+    if told != _digest(line):
+        raise ValueError("a line that was changed since it was written")
+    return line
 
 
 def _read(path: Path, lines: Lines) -> dict[str, Any]:
@@ -124,7 +157,7 @@ def _read(path: Path, lines: Lines) -> dict[str, Any]:
     finished: dict[str, Any] = {}
     for number, line in enumerate(data[:whole].splitlines(), 1):
         try:
-            key, found = lines.decode(json.loads(line))
+            key, found = lines.decode(_whole(line))
         # What a damaged line lacks shows in different ways.
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             cure = f"Remove {path} to compute all {lines.noun}s again."

@@ -266,7 +266,7 @@ def scenes_seen(
         depths = scene.background_depth_m, scene.obstructions[0].depth_m
         found.append(TrainingScene(scene, *(sources(float(depth), first + k) for depth in depths)))
     seen: TrainingScene = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
-    root = jax.random.key(seed + (_SALT_NOISE << 32))
+    root = jax.random.fold_in(jax.random.key(seed), _SALT_NOISE)
     return seen, jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.arange(first, first + len(found)))
 
 

@@ -13,7 +13,6 @@ A folder of a training (`doedesign.training.job`) has besides
 
 import logging
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,6 +60,7 @@ from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
 from sim.psf_bank import psf
 from sim.store import write_bank
+from sim.threads import cores
 
 _MOST_THREADS = 8
 _LESSON = 1  # apart from the scenes of the steps
@@ -254,7 +254,7 @@ def _scenes(spec: Spec, kind: ObstructionKind, split: Split) -> tuple[SceneData,
     # A window of the least share of a picture shall have the pixels of a crop.
     most_px = 2 * how.size if how.zoom is None else math.ceil(how.size / how.zoom[0])
     trained_on, judged_by = Pictures(split.training, most_px), Pictures(split.held_out, 2 * how.size)
-    threads = min(_MOST_THREADS, max(2, os.cpu_count() or 1))
+    threads = min(_MOST_THREADS, max(2, cores()))
     data = SceneData(trained_on, kind, view, far, how.seed, how.batch, threads, zoom=how.zoom)
     return data, SceneData(judged_by, kind, view, far, SCENE_SEED, mirrored=False)
 

@@ -24,6 +24,7 @@ from fab.units import NM, UM
 ZERO_LAYER = 10
 
 Tone = Literal["clear", "dark"]
+Resist = Literal["positive", "negative"]
 _LIMIT = 2**31 - 1
 
 
@@ -46,7 +47,8 @@ class Photomask:
     """One mask of the set: its layer, what polygons are on the photomask, and what it makes.
 
     Marks are datatype 1 of the layer, test structures 2, lettering 3. An etch mask has its bit of the levels and the
-    depth that it etches (metres); one that makes chrome has None and 0.
+    depth that it etches (metres); one that makes chrome has None and 0. Light opens a positive resist, and a negative
+    one stays where light falls.
     """
 
     layer: int
@@ -54,6 +56,12 @@ class Photomask:
     makes: Literal["etch", "liftoff", "wet etch", "zero layer"]
     bit: int | None = None
     depth_m: float = 0.0
+    resist: Resist = "positive"
+
+    @property
+    def opens(self) -> bool:
+        """Whether its polygons open the resist: where they are clear a positive one, where they are dark a negative."""
+        return (self.tone == "clear") == (self.resist == "positive")
 
     @property
     def name(self) -> str:
@@ -80,16 +88,18 @@ def photomasks_of(
 ) -> tuple[Photomask, ...]:
     """List the photomasks of a job in the order in which they are used: zero layer, etch masks, chrome.
 
-    The first of them makes the marks that all others are aligned to. `tone` is that of the etch masks. The resist is
-    the same at every step, so that chrome that is etched away around its polygons needs the other tone than chrome that
-    is lifted off, or than an etch.
+    The first of them makes the marks that all others are aligned to. `tone` is that of the etch masks, whose polygons
+    open the resist: a positive one if they are clear, a negative one if they are dark. The resist is the same at every
+    step, so that chrome that is etched away around its polygons needs the other tone than chrome that is lifted off, or
+    than an etch.
     """
     opposite: Tone = "dark" if tone == "clear" else "clear"
+    resist: Resist = "positive" if tone == "clear" else "negative"
     chrome_tone = opposite if chrome == "etch" else tone
-    zero = [Photomask(ZERO_LAYER, chrome_tone, "zero layer")] if zero_layer else []
-    etches = [Photomask(bit + 1, tone, "etch", bit, levels.etch_depth_m(bit)) for bit in order]
+    zero = [Photomask(ZERO_LAYER, chrome_tone, "zero layer", resist=resist)] if zero_layer else []
+    etches = [Photomask(bit + 1, tone, "etch", bit, levels.etch_depth_m(bit), resist) for bit in order]
     way = "liftoff" if chrome == "liftoff" else "wet etch"
-    last = [] if chrome == "none" else [Photomask(chrome_layer(levels).number, chrome_tone, way)]
+    last = [] if chrome == "none" else [Photomask(chrome_layer(levels).number, chrome_tone, way, resist=resist)]
     return (*zero, *etches, *last)
 
 

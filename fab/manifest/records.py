@@ -28,9 +28,9 @@ FORMAT = "doedesign mask order 2"
 # Nothing is converted: a number in quotes is no number.
 _STRICT = ConfigDict(strict=True, extra="forbid")
 
-CONVENTIONS = {
-    "etch layers": "polygon = etched here (digitised data clear)",
-    "chrome layer": "polygon = chrome stays here",
+CHROME_MEANS = "polygon = chrome stays here"
+_CONVENTIONS = {
+    "chrome layer": CHROME_MEANS,
     "levels": "level l of L stands as high as the depths of the masks that stay closed there sum up to (l steps where "
     "mask k etches 2^k steps); the blank glass is level L-1",
     "masks": "bit k of (L-1-level) set = mask k opens and etches its depth_nm; bit k is layer k+1, datatype 0",
@@ -47,9 +47,15 @@ _UNUSED_SETS = {
 }
 
 
-def conventions_of(levels: Levels) -> dict[str, str]:
-    """Return in words how the numbers of an order of a staircase are meant, by what they are."""
-    return CONVENTIONS if levels.is_full else CONVENTIONS | _UNUSED_SETS
+def etch_means(tone: str) -> str:
+    """Return in words what a polygon of an etch mask means whose polygons are "clear" or "dark" on the plate."""
+    return f"polygon = etched here (digitised data {tone})"
+
+
+def conventions_of(levels: Levels, tone: str) -> dict[str, str]:
+    """Return in words how the numbers of an order are meant, by what they are; `tone` is that of its etch masks."""
+    found = {"etch layers": etch_means(tone), **_CONVENTIONS}
+    return found if levels.is_full else found | _UNUSED_SETS
 
 
 @dataclass(frozen=True, config=_STRICT)

@@ -153,7 +153,7 @@ def manifest_of(
         name=level_map.name,
         geometry_sha256=order.geometry,
         source=dict(order.source),
-        conventions=conventions_of(levels),
+        conventions=conventions_of(levels, order.process.tone),
         request=request_of(order),
         levels=levels.count,
         step_nm=round(levels.step_m / NM, 9),

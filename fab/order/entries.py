@@ -12,13 +12,14 @@ from fab.layout.polygons import smallest_runs
 from fab.layout.split import DieSplit
 from fab.manifest.cells import geometry, shapes_digest
 from fab.manifest.records import (
-    CONVENTIONS,
+    CHROME_MEANS,
     ChromeEntry,
     DrawnEntry,
     MaskEntry,
     PhotomaskEntry,
     SplitEntry,
     WaferEntry,
+    etch_means,
     plane_digest,
 )
 from fab.order.order import Order
@@ -40,7 +41,7 @@ def mask_entry(order: Order, doe: Cell, bit: int, plane: NDArray[np.uint8]) -> M
         cell=stem,
         depth_nm=round(levels.etch_depth_m(bit) / NM, 9),
         edge_move_nm=round(order.edge_moves()[bit] * order.dbu_m / NM, 9),
-        polygon_means=CONVENTIONS["etch layers"],
+        polygon_means=etch_means(order.process.tone),
         smallest_width_um=width_um,
         smallest_space_um=space_um,
         plane_sha256=plane_digest(plane),
@@ -58,7 +59,7 @@ def chrome_entry(order: Order, doe: Cell) -> ChromeEntry:
         datatype=layer.datatype,
         file=order.plate_file(f"{order.stem}_CHROME"),
         cell=f"{order.stem}_CHROME",
-        polygon_means=CONVENTIONS["chrome layer"],
+        polygon_means=CHROME_MEANS,
         opening_diameter_mm=opening.record(MM, 9),
         outer_diameter_mm=round(2 * outer * order.dbu_m / MM, 9),
         overlap_um=round(order.chrome.overlap_m / UM, 9),

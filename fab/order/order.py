@@ -26,7 +26,7 @@ from fab.rules.repair import Repair, repaired
 from fab.runsheet.tables import Predictions
 from fab.solids.patch import Patch
 from fab.stock import process_from
-from fab.units import NM, UM
+from fab.units import NM, UM, format_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +39,7 @@ OnViolation = Literal["warn", "fail", "fix"]
 # Of names of files and cells, and of the endings of cells other than those of masks ("_ORDER_DIE").
 _LONGEST_NAME, _LONGEST_ENDING = 32, 10
 _FEMTO = 10**15
+_DEEP = 0.1  # of the wafer, from where on a depth is more likely a mistake in its unit
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,14 @@ class Order:
     papers: bool = False
     light: Light | None = None
     formats: Formats = field(default_factory=Formats)
+
+    def __post_init__(self) -> None:
+        """Raise an InputError for floors that leave no glass below them."""
+        deep_m, glass_m = self.level_map.levels.total_m, self.wafer.thickness_m
+        if deep_m >= glass_m:
+            rule = f"must be thicker than the deepest floor, {format_length(deep_m)}"
+            cure = "Check the unit of the height of a level, or give the thickness of the wafer."
+            raise InputError("wafer: thickness", rule, format_length(glass_m), cure)
 
     @property
     def level_map(self) -> LevelMap:
@@ -217,6 +226,10 @@ def plan_order(
     order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
     if warning := faint_marks(order.photomasks):
         log.warning(warning)
+    deep_m = level_map.levels.total_m
+    if deep_m > _DEEP * order.wafer.thickness_m:
+        thick = format_length(order.wafer.thickness_m)
+        log.warning("the deepest floor lies %s below the face of a wafer of %s", format_length(deep_m), thick)
     if on_violation == "fix" and not report.clean:
         log.info("repairing the level map")
         repair = repaired(report, waves_per_metre)

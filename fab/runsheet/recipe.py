@@ -1,7 +1,7 @@
 """Recipe for each photomask, step by step, and the arithmetic of a run sheet.
 
-The recipes are ordinary ones for fused silica: positive resist, reactive ions through it, chrome by lift-off or wet
-etch. Doses, bakes and times belong to the lab and are left blank; what follows from the order is filled in.
+The recipes are ordinary ones for fused silica: resist, reactive ions through it, chrome by lift-off or wet etch. Doses,
+bakes and times belong to the lab and are left blank; what follows from the order is filled in.
 
 Depth first: every etch has its own target, whatever another one did. If a design uses all sets of masks equally, the
 light that goes where it should is a product with one factor per mask, cos^2(phi / 2) for a phase error phi of its
@@ -27,6 +27,10 @@ RATES_M_PER_S = tuple(rate * NM / 60 for rate in (10, 20, 30))
 _TWO_SIGMA = 2.0
 # Glass etched per resist lost. Usual recipes do better than 3; twice what is lost at 3 leaves a margin.
 _SELECTIVITY, _THINNEST_M = 3.0, 1 * UM
+_RESISTS: Mapping[str, str] = {
+    "positive": "POSITIVE resist (light opens it)",
+    "negative": "NEGATIVE or image-reversal resist (it stays where light falls)",
+}
 _LIFTOFF_FOLD: Mapping[str, int] = {"evaporated": 5, "sputtered": 10}
 
 
@@ -47,12 +51,21 @@ class Step(NamedTuple):
     deepest_m: float
 
 
-def depths_m(levels: Levels) -> tuple[float, ...]:
-    """Return the depths below the blank glass that all etches make together, blank glass first, metres."""
-    depths = (
-        sum(levels.etch_depth_m(bit) for bit in range(levels.bits) if code >> bit & 1) for code in range(levels.count)
+def depths_m(levels: Levels, etches_m: Sequence[float] = ()) -> tuple[float, ...]:
+    """Return the depths below the blank glass that all etches make together, blank glass first, metres.
+
+    `etches_m` are the depths of the etches, first mask first; those of the levels by default.
+    """
+    etches_m = etches_m or levels.depths_m
+    return tuple(
+        sorted(sum(depth for bit, depth in enumerate(etches_m) if code >> bit & 1) for code in range(levels.count))
     )
-    return tuple(sorted(depths))
+
+
+def expected_m(photomask: Photomask, process: Process) -> float:
+    """Return the depth that an etch is expected to have: its target, and the mean errors of depth of a process."""
+    names = "common_depth_scale", f"depth_scale[{photomask.bit}]"
+    return photomask.depth_m * math.prod(1 + process.spreads.get(name, Normal()).mean for name in names)
 
 
 def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
@@ -65,8 +78,8 @@ def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
 
 
 def lifts_off(photomask: Photomask) -> bool:
-    """Return whether the chrome of a photomask is lifted off: clear polygons leave holes in a positive resist."""
-    return photomask.makes == "liftoff" or (photomask.makes == "zero layer" and photomask.tone == "clear")
+    """Return whether the chrome of a photomask is lifted off: it stays in polygons, and they open the resist."""
+    return photomask.makes == "liftoff" or (photomask.makes == "zero layer" and photomask.opens)
 
 
 def spread_of(process: Process, bit: int, common: str, own: str) -> Normal:
@@ -90,7 +103,7 @@ def _printing(
         Action("Prime", "HMDS vapour, so that the resist sticks to the surface."),
         Action(
             "Resist",
-            f"Spin POSITIVE resist, {format_length(float(f'{thickness_m:.3g}'))} or thicker. {why}",
+            f"Spin {_RESISTS[photomask.resist]}, {format_length(float(f'{thickness_m:.3g}'))} or thicker. {why}",
             ("thickness (um)", "resist, batch"),
         ),
         Action(
@@ -125,6 +138,8 @@ def _etch_actions(photomask: Photomask, process: Process) -> tuple[Action, ...]:
     depth_m, bit = photomask.depth_m, photomask.bit or 0
     sigma = spread_of(process, bit, "common_depth_scale", "depth_scale").sigma
     usual = "" if not sigma else f" (usual for this process: within {_TWO_SIGMA * sigma * depth_m / NM:.3g} nm)"
+    aim_m = expected_m(photomask, process)
+    known = f" This process is known to etch {aim_m / NM:.6g} nm where it is told that." if aim_m != depth_m else ""
     return (
         Action("Descum", "Oxygen plasma, short, so that no film of resist is left in the openings.", ("time (s)",)),
         Action(
@@ -134,8 +149,8 @@ def _etch_actions(photomask: Photomask, process: Process) -> tuple[Action, ...]:
         ),
         Action(
             "Etch",
-            f"Reactive ions (CHF3 or alike) into the glass, TARGET {photomask.depth}{usual}. Find "
-            f"the rate on a test piece of the same glass, the same chamber and the same day. Time = target / rate.",
+            f"Reactive ions (CHF3 or alike) into the glass, TARGET {photomask.depth}{usual}.{known} "
+            "Find the rate on a test piece of the same glass, the same chamber and the same day. Time = target / rate.",
             ("rate (nm/min)", "time (min:s)", "recipe"),
         ),
         Action(
@@ -192,18 +207,18 @@ def _by_the_edge(sheet: RunSheet) -> str:
     return "By eye, middle on middle."
 
 
-def _deepest_m(etched: Sequence[Photomask], levels: Levels) -> float:
-    """Return the depth of the deepest floor of a DOE after some etches, metres."""
-    return max(sum((p.depth_m for p in etched if code >> (p.bit or 0) & 1), 0.0) for code in range(levels.count))
+def _deepest_m(etched: Mapping[int, float], levels: Levels) -> float:
+    """Return the depth of the deepest floor of a DOE after some etches, by bit and depth, metres."""
+    return max(sum(depth for bit, depth in etched.items() if code >> bit & 1) for code in range(levels.count))
 
 
 def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
     """List the steps of a job, one per photomask in order of use."""
     chrome_m, deposition, process = sheet.chrome_m, sheet.deposition, sheet.process
-    etched: list[Photomask] = []
+    etched: dict[int, float] = {}
     steps = []
     for number, (photomask, note) in enumerate(zip(sheet.photomasks, alignment_notes(sheet.photomasks), strict=True)):
-        etched += [photomask] if photomask.bit is not None else []
+        etched |= {photomask.bit: expected_m(photomask, process)} if photomask.bit is not None else {}
         align = note if number else f"{_by_the_edge(sheet)} {note}"
         thickness_m, why = least_resist(photomask, chrome_m, deposition)
         how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."

@@ -20,6 +20,7 @@ from fab.runsheet.recipe import (
     Action,
     Step,
     depths_m,
+    expected_m,
     next_target_m,
     spread_of,
     steps_of,
@@ -94,13 +95,13 @@ def _width_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
 
 
 def _depth_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
-    lag = sheet.process.spreads.get("etch_lag", Normal()).mean
+    lag, aim_m = sheet.process.spreads.get("etch_lag", Normal()).mean, expected_m(photomask, sheet.process)
     return [
         {
             "pad": name,
             "target_nm": _nm(photomask.depth_m),
             # A pad loses the share lag x depth / width of its depth.
-            "expected_nm": round(photomask.depth_m * (1 - lag * photomask.depth_m / side_m) / NM, 2),
+            "expected_nm": round(aim_m * (1 - lag * aim_m / side_m) / NM, 2),
             **_first_place(sheet, f"depth pad {name}", photomask),
         }
         for name, side_m in PADS.items()
@@ -136,19 +137,17 @@ def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> d
     photomask = step.photomask
     # The sum of all depths is the full one only where the deepest floor is made by all masks.
     following = later[0] if later and sheet.level_map.levels.is_full else None
-    corrections = []
+    corrections, aim_m = [], expected_m(photomask, sheet.process)
     if following:
+        next_m = expected_m(following, sheet.process)
+        told = following.depth_m / next_m  # what the process is told, over what it etches
         corrections = [
-            {
-                "off_by_nm": miss,
-                "next_target_nm": _nm(
-                    next_target_m(photomask.depth_m, photomask.depth_m + miss * NM, following.depth_m)
-                ),
-            }
+            {"off_by_nm": miss, "next_target_nm": _nm(told * next_target_m(aim_m, aim_m + miss * NM, next_m))}
             for miss in _MISSES_NM
         ]
     return {
         "target_nm": _nm(photomask.depth_m),
+        "expected_nm": _nm(aim_m),
         "deepest_floor_nm": _nm(step.deepest_m),
         "time_formula": "time = target / rate",
         "times": [
@@ -251,6 +250,8 @@ def record(sheet: RunSheet) -> dict[str, Any]:
     """Return the run sheet as JSON values, the unit of every length in its key, all under "measured" null."""
     process, wafer = sheet.process, sheet.wafer
     wall = process.spreads.get("sidewall_rad", Normal())
+    by_bit = {photomask.bit: expected_m(photomask, process) for photomask in sheet.photomasks}
+    expected = [by_bit[bit] for bit in range(sheet.level_map.levels.bits)]
     return {
         "format": FORMAT,
         "job": sheet.stem,
@@ -283,7 +284,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "vernier_step_um": _um(VERNIER_STEP_M),
         "reference": sheet.photomasks[0].name,
         "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps_of(sheet), start=1)],
-        "staircase_nm": [_nm(depth) for depth in depths_m(sheet.level_map.levels)],
+        "staircase_nm": [_nm(depth) for depth in depths_m(sheet.level_map.levels, expected)],
         "inspected": _inspected(sheet),
         "places_mm": {name: [*_mm(place).values()] for name, place in sheet.places.items()},
         "predicted": None if sheet.predictions is None else _predicted_record(sheet.predictions),

@@ -1,7 +1,6 @@
 """Certificate of a design: rows and squares cut out of it, as thin elements, with edges, and by Maxwell's equations."""
 
 import itertools
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, NamedTuple
@@ -17,6 +16,7 @@ from sim.material import refractive_index
 from sim.rigorous.comparison import RowComparison, compare_row
 from sim.rigorous.crossed import travelling_terms
 from sim.rigorous.pieces import PieceComparison, compare_piece
+from sim.threads import cores
 
 # Shares of the way from the axis to the rim at which rows are cut out.
 SHARES = (0.0, 0.25, 0.5, 0.75, 0.9)
@@ -186,7 +186,7 @@ def certify_rows(
 
     found = []
     # Several threads make one of these matrices slower: twice with nothing else to do, and twenty times beside others.
-    with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count()) as pool:
+    with threadpool_limits(1), ThreadPoolExecutor(cores()) as pool:
         for one in pool.map(solved, *zip(*itertools.product(wavelengths_m, rows), strict=True)):
             found.append(one)
             on_row()
@@ -218,7 +218,7 @@ def certify_pieces(
         return CertifiedPiece(piece, wavelength_m, fine, fine.error(coarse.rigorous))
 
     found = []
-    with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count()) as pool:
+    with threadpool_limits(1), ThreadPoolExecutor(cores()) as pool:
         for one in pool.map(solved, *zip(*itertools.product(wavelengths_m, pieces), strict=True)):
             found.append(one)
             on_piece()

@@ -105,8 +105,15 @@ def test_only_broken_files_are_an_error(tmp_path: Path):
         (tmp_path / name).write_bytes(b"broken")
     pictures = Pictures(picture_files(tmp_path))
     assert pictures.get(0) is None
-    with pytest.raises(InputError, match=r"at least one picture must be whole.*a\.png, b\.png"):
-        pictures.get(1)
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"at least one picture must be whole.*a\.png, b\.png"):
+            pictures.following(3)
+
+
+def test_a_picture_that_cannot_be_read_is_followed_by_the_next(folder: Path):
+    pictures = Pictures(picture_files(folder))
+    names = [pictures.following(number)[0] for number in range(7)]
+    assert names == ["a.png", "b.jpg", *["c.webp"] * 4, "a.png"]
 
 
 def test_folders_without_pictures(tmp_path: Path):
@@ -145,5 +152,5 @@ def test_threads_share_one_decoding(folder: Path):
 def test_the_digest_is_that_of_the_folder(folder: Path):
     digest = Pictures(picture_files(folder)).digest()
     assert Pictures(picture_files(folder)).digest() == digest
-    (folder / "a.png").unlink()
+    (folder / "a.png").write_bytes((folder / "a.png").read_bytes()[:-1] + b"x")  # as long as before
     assert Pictures(picture_files(folder)).digest() != digest

@@ -257,6 +257,22 @@ def test_what_must_be_named_and_whole(run: Path, images: Path, tmp_path: Path):
     simulate(run, tmp_path / "out", images)  # nothing was made in it yet
 
 
+def test_what_others_keep_beside_the_items_stays(run: Path, images: Path, tmp_path: Path):
+    """Reconstructions beside the captures that they are of, and a simulation in its own folder."""
+    out = tmp_path / "out"
+    simulate(run, out, images)
+    item = next(out.glob("0*/manifest.json"))
+    (out / "restored").mkdir()
+    (out / "restored" / "manifest.json").write_text('{"format": "doedesign reconstructions 1"}')
+    (out / "other").mkdir()
+    (out / "other" / "manifest.json").write_text((out / "manifest.json").read_text())
+    before = item.read_bytes()
+    simulate(run, out, images)
+    assert (out / "restored" / "manifest.json").is_file()
+    assert (out / "other" / "manifest.json").is_file()
+    assert item.read_bytes() == before
+
+
 def test_folders_of_others_are_left_alone(run: Path, images: Path, tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years of work")

@@ -28,6 +28,7 @@ from doedesign.tolerancing.studies import Study, study
 from fab.aperture import RectangularAperture
 from fab.draws import normal_keys
 from fab.errors import InputError
+from fab.files import sha256_bytes
 from fab.process import variation_of
 
 HERE = Path(__file__).parent
@@ -189,12 +190,19 @@ DAMAGED = [
 ]
 
 
+def with_digest(line: bytes) -> bytes:
+    """A line as the journal writes it."""
+    values = json.loads(line)
+    digest = sha256_bytes(json.dumps(values, sort_keys=True).encode())[:16]
+    return json.dumps({**values, "sha256": digest}).encode()
+
+
 def test_draws_with_other_rows_are_refused(ask: Callable[..., Study], tmp_path: Path):
     """A line that is a draw by itself, but none of this study."""
     (tmp_path / "out").mkdir()
     ask(out=tmp_path / "out").monte_carlo(1)
     path = tmp_path / "out" / "draws.jsonl"
-    path.write_text('{"key": "normal/0", "rows": [{"colour": "green", "depth_m": 0.125}]}\n')
+    path.write_bytes(with_digest(b'{"key": "normal/0", "rows": [{"colour": "green", "depth_m": 0.125}]}') + b"\n")
     with pytest.raises(InputError, match=r"draws\.jsonl: all draws must have the same rows.*normal/.*Remove"):
         ask(out=tmp_path / "out").monte_carlo(2)
 
@@ -204,7 +212,10 @@ def test_a_damaged_line_is_named(ask: Callable[..., Study], tmp_path: Path):
     ask(out=tmp_path / "out").monte_carlo(1)
     path = tmp_path / "out" / "draws.jsonl"
     whole = path.read_bytes()
-    for line in DAMAGED:
+    changed = whole.replace(b'strehl": 0.', b'strehl": 0.0', 1)
+    assert changed != whole
+    signed = [with_digest(line) for line in DAMAGED if line.startswith(b"{")]
+    for line in (*DAMAGED, *signed, b"7", changed.rstrip()):
         path.write_bytes(line + b"\n" + whole)
         with pytest.raises(InputError, match=r"draws\.jsonl, line 1: must be one finished draw.*Remove"):
             ask(out=tmp_path / "out").monte_carlo(2)

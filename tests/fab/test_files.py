@@ -80,6 +80,14 @@ def test_a_path_under_a_file_is_refused_by_name(tmp_path):
         pass
 
 
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc")
+def test_where_nothing_can_be_made_is_refused_at_once():
+    with pytest.raises(InputError, match="/proc/doedesign"):
+        write_atomic("/proc/doedesign.toml", b"x")
+    with pytest.raises(InputError, match="/proc/doedesign"), atomic_folder("/proc/doedesign"):
+        pass
+
+
 def test_a_folder_that_may_not_be_written_is_refused(tmp_path):
     if os.geteuid() == 0:
         pytest.skip("root may write everywhere")

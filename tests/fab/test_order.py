@@ -1,4 +1,5 @@
 import logging
+import math
 import shutil
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from fab.manifest.records import read_manifest
 from fab.order.order import plain_name, plan_order
 from fab.order.terms import OrderTerms
 from fab.order.write import write_order
+from fab.units import UM
 from fab.verification.files import read_drawn_levels
 from tests.fab.maps import FEW, PLAIN, SMALL, level_map_from, wide_map
 
@@ -210,6 +212,27 @@ def test_the_longest_names_fit_thirty_two_characters(pitch_m, step_m):
     assert order.stem.startswith("A_V")
     assert max(len(order.mask_stem(bit)) for bit in range(4)) <= 32
     assert len(f"{order.stem}_ORDER_DIE") <= 32
+
+
+def test_floors_leave_glass_below_them(level_map, caplog):
+    """A step of 75 um for 75 nm."""
+    deep = replace(level_map, levels=Levels(level_map.levels.count, 75 * UM))
+    with pytest.raises(InputError, match=r"wafer: thickness: must be thicker than the deepest floor.*but got 500 um"):
+        plan_order(deep)
+    plan_order(replace(level_map, levels=Levels(level_map.levels.count, 5 * UM)), wafer=Wafer(thickness_m=0.6e-3))
+    assert "the deepest floor lies 75 um below the face of a wafer of 600 um" in caplog.text
+
+
+@pytest.mark.parametrize("length_m", [1e300, math.inf, math.nan, 0.0, -1e-7])
+def test_lengths_that_no_drawing_has_are_refused(length_m):
+    """Before anything is computed with them: their squares and sums are no numbers."""
+    with pytest.raises(InputError, match="level step: must be positive and at most 1 km"):
+        Levels(4, length_m)
+    with pytest.raises(InputError, match="etch depths: must be positive and at most 1 km"):
+        Levels(4, 1e-7, (1e-7, length_m))
+    for pitch_m in (length_m, 1e-300):
+        with pytest.raises(InputError, match="grid: pitch: must lie between 1 pm and 1 km"):
+            Grid((4, 4), pitch_m)
 
 
 def test_a_name_of_which_nothing_is_left_is_refused():

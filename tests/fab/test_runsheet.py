@@ -9,6 +9,7 @@ import pytest
 from fab.errors import InputError
 from fab.files import canonical_json
 from fab.levels import Levels
+from fab.process import Normal
 from fab.runsheet.recipe import depths_m, least_resist, next_target_m
 from fab.runsheet.tables import CertifiedOrder
 from fab.runsheet.write import BARS, PADS, record, run_sheet_page
@@ -198,6 +199,48 @@ def test_line_widths_are_those_at_which_the_doe_comes_out_as_designed():
     # The process prints lines of 1.2 um and says nothing of gaps.
     assert [row["bar"] for row in first if row["below_process"]] == ["1 um line"]
     assert all(row["x_mm"] is not None for row in (*first, *second))
+
+
+@pytest.mark.parametrize("tone", ["clear", "dark"])
+@pytest.mark.parametrize("chrome", ["liftoff", "etch"])
+@pytest.mark.parametrize("zero_layer", [False, True])
+def test_the_resist_is_that_which_makes_of_polygons_what_they_mean(tone, chrome, zero_layer):
+    """Light falls through what is no chrome of a photomask; it opens a positive resist, and a negative one stays."""
+    made = sheet(tone=tone, chrome=chrome, zero_layer=zero_layer)
+    for plate, step in zip(made.photomasks, record(made)["steps"], strict=True):
+        (resist,) = (row["how"] for row in step["before"] if row["task"] == "Resist")
+        (plate_words,) = (row["how"] for row in step["before"] if row["task"] == "Load the mask")
+        lit = "polygons are CLEAR" in plate_words
+        assert lit != ("polygons are DARK" in plate_words)
+        assert ("POSITIVE" in resist) != ("NEGATIVE" in resist)
+        opened = lit == ("POSITIVE" in resist)  # in the polygons
+        tasks = [row["task"] for row in (*step["before"], *step["after"])]
+        if plate.bit is not None:
+            assert opened, "etched in its polygons"
+        else:  # chrome stays in its polygons: it is laid down where the resist is open, or etched away there
+            assert ("Lift off" in tasks) == opened
+            assert ("Etch the chrome" in tasks) != opened
+
+
+def test_what_the_process_is_known_to_do_to_depths_is_expected_and_not_undone():
+    """Told 71.4 nm, a process that etches 5.04 % too deep makes 75 nm, and 75 nm is what is to be measured."""
+    levels = Levels(4, 75 * NM, (71.4 * NM, 140 * NM))
+    spreads = {"common_depth_scale": Normal(0.04, 0.01), "depth_scale[0]": Normal(0.01, 0.0)}
+    content = record(sheet(levels, spreads=spreads))
+    first, second = (content["steps"][step]["etch"] for step in (0, 1))
+    assert (first["target_nm"], first["expected_nm"]) == (71.4, pytest.approx(71.4 * 1.04 * 1.01))
+    assert second["expected_nm"] == pytest.approx(140 * 1.04)
+    assert [row["expected_nm"] for row in first["pads"]] == [round(71.4 * 1.04 * 1.01, 2)] * 3
+    assert content["staircase_nm"] == pytest.approx([0, 75, 145.6, 220.6], abs=2e-3)
+    assert second["deepest_floor_nm"] == content["staircase_nm"][-1]
+    # 10 nm too deep: 10 nm less are etched next, for which 10 / 1.04 less are asked.
+    assert {row["off_by_nm"]: row["next_target_nm"] for row in first["corrections"]}[10] == pytest.approx(
+        140 - 10 / 1.04, abs=1e-6
+    )
+    text = page_of(content).text
+    assert "of which 74.999 nm are expected" in text
+    assert "next time = expected depth of the next etch / true rate" in text
+    assert "are expected: what the process" not in page_of(record(sheet())).text
 
 
 def test_depth_pads_say_what_etch_lag_does():
