@@ -1,6 +1,6 @@
 """Frames of a camera: one exposure as its file holds it, with what the file says about its pixels.
 
-OpenEXR (through `sim.store`), 16-bit or floating-point TIFF, 16-bit grey PNG, and camera RAW by way of rawpy (the extra
+OpenEXR (through `sim.store`), 16-bit or floating-point TIFF, 16-bit PNG, and camera RAW by way of rawpy (the extra
 `raw`). Eight bits, two of a PSF's five decades, are refused unless asked for. Of a RAW mosaic the pixels of one colour
 are taken as they lie, the others marked as not valid. Arrays have row 0 at the lowest y, a picture's last row.
 """
@@ -85,9 +85,6 @@ def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> Cam
 def _read_picture(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
     values = read_pixels(path)
     if values.ndim == 3:
-        if path.suffix.lower() == ".png":
-            cure = "Save a TIFF, which keeps 16 bits of each colour."
-            raise InputError(str(path), "a PNG must be grey", f"colours (shape {values.shape})", cure)
         if values.shape[2] != 3:
             raise InputError(str(path), "an image must be grey or RGB", f"shape {values.shape}", "Keep one channel.")
         values = values[:, :, _CHANNELS.index(_named(path, channel))]

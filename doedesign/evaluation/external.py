@@ -82,29 +82,26 @@ def _eight_bits(picture: Float[np.ndarray, "3 y x"]) -> np.ndarray:
     return np.round(255 * np.clip(picture, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
 
 
-def run_program(method: ExternalMethod, given: Path, found: Path, timeout_s: float | None = None) -> None:
+def run_program(method: ExternalMethod, given: Path, found: Path) -> None:
     """Run a program on a folder of pairs.
 
     Args:
         method: the program.
         given: folder of what it sees.
         found: folder that it is to fill, which is made.
-        timeout_s: seconds after which it is ended.
 
     Raises:
-        InputError: it cannot be started, does not end, or ends with an error.
+        InputError: it cannot be started, or ends with an error.
     """
     found.mkdir(parents=True, exist_ok=True)
     places: Mapping[str, str] = {"{in}": str(given.resolve()), "{out}": str(found.resolve())}
     words = [_with(word, places) for word in method.command]
     where, cure = f"method {method.name}", "Try the command by itself on that folder."
     try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=timeout_s, check=False)
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
     except OSError as error:
         got = f'"{error.strerror or error}"'
         raise InputError(where, f"{words[0]} must be a program that can be run", got, "Correct it.") from error
-    except subprocess.TimeoutExpired as error:
-        raise InputError(where, f"must end within {timeout_s:g} s", "still running", cure) from error
     if done.returncode:
         said = (done.stderr or done.stdout).strip()[-_WORDS_SHOWN:]
         raise InputError(where, "must end without an error", f"exit code {done.returncode}: {said}", cure)

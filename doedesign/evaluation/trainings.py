@@ -162,8 +162,9 @@ def _steps_shown(plan: TrainingPlan, missing: Sequence[tuple[Training, int]]) ->
     with meter(f"steps of {len(missing)} trainings", spec.train.steps * len(missing), done()) as progress:
 
         def watch() -> None:
-            seen = -1
-            while not ended.wait(1.0):
+            seen, going = -1, True
+            while going:  # and once more when all has ended
+                going = not ended.wait(1.0)
                 if (count := done()) != seen:
                     progress.advance(seen := count)
 

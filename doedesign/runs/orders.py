@@ -72,15 +72,14 @@ def place_of_order(level_map: LevelMap, origin: Mapping[str, Any], run: Path | N
     return next((place for place in places if _holds_same(place, level_map, origin)), places[0])
 
 
-def free_place(name: str, folder: Path | None, masks: Path = MASKS) -> Path:
+def free_place(name: str, folder: Path | None) -> Path:
     """A folder for the order of a run that holds nothing yet: `masks/NAME`, or named for the run folder.
 
     Args:
         name: name of its design.
         folder: the run folder, if there is one.
-        masks: the folder of orders.
     """
-    return next(place for place in _numbered(masks, name, folder) if not place.exists() or _is_empty(place))
+    return next(place for place in _numbered(MASKS, name, folder) if not place.exists() or _is_empty(place))
 
 
 def is_order_of(folder: Path, level_map: LevelMap) -> bool:

@@ -197,7 +197,6 @@ def order_table(
     period_m: float | None = None,
     count: tuple[int, int] | None = None,
     levels: int = 0,
-    depth_m: float = np.inf,
 ) -> OrderTable:
     """Look at the spots of a DOE: as drawn, as fabricated, with or without the light of its walls.
 
@@ -209,7 +208,6 @@ def order_table(
             neighbours add to a peak.
         count: columns and rows of a grid of equal spots, for the ceiling.
         levels: levels of the DOE, for the ceiling.
-        depth_m: distance of the source, metres.
     """
     camera, line = optic.camera, optic.camera.lines[0]
     # Directions are what a lens would show in its focus, whatever the light on the DOE and the way behind it.
@@ -217,7 +215,7 @@ def order_table(
     focal = {"distance_m": None, "focal_length_m": camera.distance_m} if away else {}
     bare = camera.beam is not None or away
     plain = replace(optic, camera=replace(camera, beam=None, **focal)) if bare else optic
-    field, coverage, grid = np.asarray(plain.field(line, depth_m)), np.asarray(optic.coverage), camera.grid
+    field, coverage, grid = np.asarray(plain.field(line, np.inf)), np.asarray(optic.coverage), camera.grid
     if camera.beam is not None and period_m is None:  # a spot is what has the shape of the beam's own far field
         light = camera.irradiance(line.wavelength_m)
         field, coverage = field * light, coverage * light

@@ -61,11 +61,11 @@ def _variance(low: float | None, expected: float, high: float) -> float:
     return slope**2 + 2 * curvature**2
 
 
-def source_shares(effects: Sequence[Effect], quantity: str, colour: str | None = None) -> dict[str, float]:
+def source_shares(effects: Sequence[Effect], quantity: str) -> dict[str, float]:
     """Approximate share of each source in a quantity's variance, if errors do not act together; largest first."""
     variances = dict.fromkeys((error.source for error in DEVIATIONS.values()), 0.0)
     for effect in effects:
-        if (effect.quantity, effect.colour) == (quantity, colour) and np.isfinite(effect.variance):
+        if (effect.quantity, effect.colour) == (quantity, None) and np.isfinite(effect.variance):
             variances[effect.source] += effect.variance
     total = sum(variances.values())
     shares = {source: value / total for source, value in variances.items() if value > 0}

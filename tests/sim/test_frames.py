@@ -1,6 +1,8 @@
 """What a camera's files hold, read as they are; what cannot be a measurement is refused by name."""
 
+import struct
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -138,8 +140,8 @@ def test_what_is_no_measurement_is_refused_by_name(tmp_path: Path):
     with pytest.raises(InputError, match="one grey or colour picture, but got 2 pages"):
         read_frame(tmp_path / "stack.tiff")
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "colour.png")
-    with pytest.raises(InputError, match="a PNG must be grey"):
-        read_frame(tmp_path / "colour.png")
+    with pytest.raises(InputError, match=r"colour\.png: a measured PSF needs 16 bits per pixel, but got 8 bits"):
+        read_frame(tmp_path / "colour.png", channel="green")
     (tmp_path / "text.tiff").write_text("no picture")
     with pytest.raises(InputError, match=r"text\.tiff: the file must be whole"):
         read_frame(tmp_path / "text.tiff")
@@ -148,6 +150,16 @@ def test_what_is_no_measurement_is_refused_by_name(tmp_path: Path):
             read_frame(tmp_path / name)
     with pytest.raises(InputError, match=r"an image must be one of .*but got \.jpg"):
         read_frame(tmp_path / "a.jpg")
+
+
+def test_a_png_in_colour_keeps_sixteen_bits_of_each(tmp_path: Path):
+    """Pillow writes none, so the file is made by the format's own rules."""
+    values = np.random.default_rng(0).integers(0, 65536, (5, 7, 3), np.uint16)
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    chunks = {b"IHDR": struct.pack(">IIBBBBB", 7, 5, 16, 2, 0, 0, 0), b"IDAT": zlib.compress(rows), b"IEND": b""}
+    parts = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks.items())
+    (tmp_path / "colour.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    assert np.array_equal(read_frame(tmp_path / "colour.png", channel="green").counts, values[::-1, :, 1])
 
 
 def test_a_measured_psf_of_another_lab():

@@ -10,20 +10,13 @@ import base64
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 TILE = 512
 _LEVEL = 6
-
-
-class TilePyramid(NamedTuple):
-    """Tiles of one map: of every reduction (1, 2, 4 ...), rows of base 64 from the top left."""
-
-    reductions: tuple[int, ...]
-    tiles: dict[int, list[list[str]]]
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
