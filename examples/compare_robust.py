@@ -46,7 +46,10 @@ RING = '{ name = "ring_to_disc", weight = 0.3, options = { least = 2.5 } }'
 
 
 class Plates(NamedTuple):
-    """Some plates of a design and a process; the worst colour and depth of each, and the design as drawn."""
+    """Some plates of a design and a process, and the design as drawn.
+
+    0th order and ring:disc ratio are those of the worst colour and depth of a plate, far spots the mean over all.
+    """
 
     design: str
     process: str

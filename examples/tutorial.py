@@ -15,8 +15,8 @@
 #
 # The tutorial of the documentation in Python. Run it from the root of the repository: in JupyterLab or VS Code as a
 # notebook (jupytext), or as it is, `python examples/tutorial.py`. It takes a quarter of the quick example's cells, so
-# that the whole way takes about two minutes on two cores, much of it spent compiling. Lengths are SI numbers, or text
-# with a unit.
+# that the whole way takes about two minutes on two cores, much of it spent compiling. Lengths given to functions are SI
+# numbers, or text with a unit; those of a spec are text with a unit, as in its TOML file.
 
 # %%
 import sys

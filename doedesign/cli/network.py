@@ -32,7 +32,10 @@ NearDepth = Annotated[
 ]
 FarDepth = Annotated[
     str | None,
-    Parameter(help='Distance of the scene, such as "5 m" or inf; the farthest there is a PSF of by default.'),
+    Parameter(
+        help='Distance of the scene, such as "5 m" or inf; by default that which the model was trained for, or the '
+        "farthest there is a PSF of where the model states none."
+    ),
 ]
 
 

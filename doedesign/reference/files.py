@@ -111,7 +111,7 @@ FOLDERS: tuple[WrittenFolder, ...] = (
         "identity of the job, such as QUICK_A_1P85_3F2A.",
         (
             WrittenFile(
-                "*_ALL.oas", "the review file: plate, wafer, dies, DOE, marks, test structures, labels (OASIS)"
+                "*_ALL.oas", "the review file: mask blank, wafer, dies, DOE, marks, test structures, labels (OASIS)"
             ),
             WrittenFile("*_ALL.gds", "the same as GDSII, with --combined-gds"),
             WrittenFile("*_M[0-9]*.gds.gz", "one file per etch mask, GDSII packed by gzip (.gds with --plates gds)"),

@@ -154,7 +154,11 @@ _AIMED = {
         "sim.material.fresnel_transmission",
     ),
     "ceiling": ResultNumber(
-        "share", "0 to 1; null where none is known", "largest on_target that is known to be possible", ""
+        "share",
+        "0 to 1; null where none is known",
+        "largest on_target that is known for equal spots of so many levels, by free phases on a fine grid; few phases "
+        "or unequal spots may pass it",
+        "",
     ),
     "ceiling_source": ResultNumber(
         "text", "a sentence", "where the ceiling is from", "doedesign.spots.orders.ceiling_of"

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from doedesign.areas.shape import AreaTable
 
 _SIDE = 3.4  # inches of the map
-_TOP = 1.4  # end of the colour scale: speckle is a few times brighter
+_TOP = 1.4  # end of the colour scale, over the brightest light wanted: speckle is a few times brighter
+_LEGEND = 1.35  # height of the axis of profiles over that of their light: the legend lies above them
+_TICKS = 5
 
 
 _NOTE = "Shares of the incident light; {:.1f} % that faces reflect are left out. Contrast: root mean square where 90 % "
@@ -61,9 +63,12 @@ def _draw(table: "AreaTable", figure: "FigureBase") -> None:
     box = [end / unit.scale for end in (x[0], x[-1], y[0], y[-1])]
     panes = np.atleast_1d(figure.subplots(1, 2 if profiles else 1, width_ratios=(1.0, 1.15)[: 1 + bool(profiles)]))
     image = shrunk(table.light.astype(np.float32), round(_SIDE * DPI))
-    shown = panes[0].imshow(image, origin="lower", extent=box, vmin=0, vmax=_TOP, cmap=LIGHT)
+    brightest = float(target.wanted.max() / target.wanted[target.flat].mean())  # a picture has parts of its own
+    shown = panes[0].imshow(image, origin="lower", extent=box, vmin=0, vmax=_TOP * brightest, cmap=LIGHT)
     label_places(panes[0], unit)
-    panes[0].locator_params(nbins=5)
+    wide, high = box[1] - box[0], box[3] - box[2]
+    for axis, share in (("x", wide / max(wide, high)), ("y", high / max(wide, high))):
+        panes[0].locator_params(axis, nbins=max(1, round(_TICKS * share)), min_n_ticks=1)  # a line is narrow
     figure.colorbar(shown, ax=panes[0], label="light over that inside", shrink=0.8, extend="max")
     for (name, profile), colour in zip(profiles, (LINE, MARK), strict=False):
         size, place = profile.size_m, profile.in_unit(profile.place_m, MICROMETRES)
@@ -72,6 +77,6 @@ def _draw(table: "AreaTable", figure: "FigureBase") -> None:
         panes[1].plot(place, profile.light, color=colour, lw=1, label=label)
         panes[1].plot(place, profile.wanted, color=colour, lw=0.8, ls=":")
     if profiles:
-        top = max(1.3, 1.05 * max(p.light.max() for _, p in profiles))
+        top = _LEGEND * max(1.0, *(p.light.max() for _, p in profiles))
         panes[1].set(xlabel=f"from the middle ({unit.name})", ylim=(0, top))
         panes[1].legend(loc="upper right", title="size at half the light; dots: wanted")

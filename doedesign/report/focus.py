@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from doedesign.focus.depth import FocusTable
 
+_DECADE = 10.0
+
 
 def plot_focus(table: "FocusTable", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the widths of foci beside those wanted, the light on the axis, and profiles."""
@@ -32,13 +34,16 @@ def plot_focus(table: "FocusTable", ax: "Axes | None" = None) -> "FigureBase":
             line = {"color": None if name else LINE, "marker": "o", "ms": 3, "lw": 1}
             drawn = panes[0].plot(distance, width[own].mean(1) / UM, **line, label=f"{name}as it is")
             shade = drawn[0].get_color()
-            panes[0].plot(distance, foci.width_m[own] / UM, color=shade if name else MARK, lw=1, ls=":")
+            # Markers, for a line through a single focus shows nothing.
+            wanted = {"color": shade if name else MARK, "marker": "x", "ms": 3, "lw": 1, "ls": ":"}
+            panes[0].plot(distance, foci.width_m[own] / UM, **wanted)
             panes[1].plot(distance, 100 * table.strength[own], **(line | {"color": shade}))
-            panes[1].plot(distance, 100 * table.share[own], color=shade, lw=1, ls="--")
+            panes[1].plot(distance, 100 * table.share[own], color=shade, marker="o", mfc="none", ms=3, lw=1, ls="--")
         panes[0].set(xlabel="distance (mm)", ylabel="width (µm)")
-        panes[0].legend(loc="upper left", title="dots: wanted")
+        panes[0].legend(loc="best", title="×, dotted: wanted")
         panes[1].set(xlabel="distance (mm)", ylabel="%", yscale="log")
-        panes[1].set_title("— light over an ideal lens's\n– – share within the width wanted", fontsize=7, loc="left")
+        _number_plainly(panes[1])
+        panes[1].set_title("● light over an ideal lens's\n○ share within the width wanted", fontsize=7, loc="left")
         if foci.distance_m.max() > 4 * foci.distance_m.min():
             panes[0].set(xscale="log", yscale="log")
             panes[1].set(xscale="log")
@@ -51,3 +56,10 @@ def plot_focus(table: "FocusTable", ax: "Axes | None" = None) -> "FigureBase":
         panes[2].set(xlabel="from the axis, over the width wanted", ylabel="distance (mm)")
         figure.colorbar(shown, ax=panes[2], label="light over that on the axis", extend="max")
     return figure
+
+
+def _number_plainly(axes: "Axes") -> None:
+    """Number a logarithmic axis y by 9 and 90, not by powers of ten; between these only within one decade."""
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}" if high < _DECADE * low else "")

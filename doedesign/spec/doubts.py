@@ -19,7 +19,7 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 def spec_warnings(spec: Spec) -> list[str]:
     """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
     rules = (_level_warning, _printing_warning, _window_warnings, _pixel_warning, _occlusion_warning, _limit_warnings)
-    rules = (*rules, _mask_warning)
+    rules = (*rules, _mask_warning, _walls_warning)
     return [warning for rule in rules for warning in rule(spec)]
 
 
@@ -30,6 +30,16 @@ def _mask_warning(spec: Spec) -> Iterator[str]:
         yield (
             f"doe.aperture: the chrome, which reaches {format_length(overlap)} over every edge, closes {closed[1]} of "
             f"the {closed[0]} parts of the mask. A smaller process.chrome_overlap leaves them open."
+        )
+
+
+def _walls_warning(spec: Spec) -> Iterator[str]:
+    """Warn that the light of walls has no part in a search which looks at thin elements alone."""
+    targets = {"spots": spec.spots, "areas": spec.areas, "foci": spec.focus}
+    if spec.optics.light == "edges" and (searched := [name for name, table in targets.items() if table]):
+        yield (
+            f'optics.light: the light of walls that "edges" adds is not in the search of {searched[0]}, which gives '
+            "the same design without it; the finished plate is judged with edges."
         )
 
 

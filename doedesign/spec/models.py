@@ -130,8 +130,8 @@ class OpticsSpec(SpecTable, frozen=True):
         doe_distance_m: distance of the DOE before the lens. Depths of the scene count from the DOE, and the lens must
             let all its light pass. It matters only to a sensor out of focus. Far field only.
         light: "scalar" (a thin element) or "edges" (walls between cells add their light, certified against Maxwell's
-            equations; up to one and a half times the time). Rings are optimised as thin elements and judged with
-            their edges.
+            equations; up to one and a half times the time). The loss of objectives for cells has them; rings, spots,
+            areas and foci are searched for as thin elements, and judged with their edges.
         polarisation: of the light at walls: "unpolarised", or "x" or "y", the axis of the electric field.
     """
 

@@ -156,11 +156,12 @@ class OrderTable:
 
     def describe(self) -> str:
         """One line."""
-        bound = "none known" if self.ceiling.efficiency is None else f"{100 * self.ceiling.efficiency:.1f} %"
+        known = self.ceiling.efficiency
+        bound = "ceiling: none known" if known is None else f"ceiling of equal spots: {100 * known:.1f} %"
         wave = f", {self.wave}" if self.wave else ""
         wanted = f" ({ONE_OF_THE_SPOTS})" if self.zeroth_order_wanted else ""
         return (
-            f"{self.spots.count} spots: {100 * self.total:.2f} % of the light (ceiling: {bound}), uniformity error "
+            f"{self.spots.count} spots: {100 * self.total:.2f} % of the light ({bound}), uniformity error "
             f"{100 * self.uniformity_error:.2f} %{wave}, 0th order {100 * self.zeroth_order:.3f} %{wanted}; Fresnel "
             f"loss of {100 * (1 - self.fresnel):.1f} % apart"
         )

@@ -20,6 +20,7 @@ from doedesign.spec import (
     spec_to_toml,
     spec_warnings,
 )
+from doedesign.templates import template_text
 from fab.errors import InputError
 from fab.files import canonical_json
 
@@ -409,6 +410,23 @@ def test_a_level_step_that_misses_the_wave_is_explained():
 )
 def test_doubts_are_said(overrides: list[str], part: str):
     assert any(part in warning for warning in spec_warnings(load_spec(AUTOMOTIVE, overrides)))
+
+
+@pytest.mark.parametrize(
+    ("template", "what"), [("splitter", "spots"), ("fan_out", "spots"), ("diffuser", "areas"), ("bifocal", "foci")]
+)
+def test_walls_that_no_search_looks_at_are_told(tmp_path: Path, template: str, what: str):
+    path = tmp_path / "spec.toml"
+    path.write_text(template_text(template))
+    assert spec_warnings(load_spec(path)) == []
+    (warning,) = spec_warnings(load_spec(path, ["optics.light=edges"]))
+    assert warning.startswith("optics.light: ")
+    assert f"is not in the search of {what}," in warning
+    assert "the finished plate is judged with edges" in warning
+
+
+def test_walls_in_the_loss_of_objectives_are_no_doubt():
+    assert spec_warnings(load_spec(AUTOMOTIVE, ["optics.light=edges"])) == []
 
 
 def test_an_occlusion_model_that_pictures_will_need_is_told_at_once(tmp_path: Path):
