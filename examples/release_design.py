@@ -137,8 +137,8 @@ def words(
         commands,
         "and is a run itself: `doedesign masks` draws its order; `doedesign psf`, `tolerance` and `simulate` take it.\n"
         "The same bytes come out on the same processor and libraries; on others some cells may take another level.",
-        "As drawn, shares of the incident light (concentration: over that of the plain lens; one below its bound means\n"
-        "that light leaves the window):",
+        "As drawn, shares of the incident light (concentration: over that of the plain lens; one below its bound\n"
+        "means that light leaves the window):",
         "\n".join(drawn),
         f"{count} predicted plates of the stock process `{process}`, from the nearest and the farthest depth:",
         "\n".join(plates),
