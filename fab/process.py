@@ -92,7 +92,7 @@ class Process:
         order: masks in the order in which they are etched; shallow to deep by default.
         spreads: mean and standard deviation of errors by flat name (`error_names`); what is missing is zero.
         defects: rare events.
-        tone: what a mask's polygons mean on the plate, "clear" (dark-field plate) or "dark".
+        tone: what polygons are on a photomask, "clear" (dark field, positive resist) or "dark" (clear field, negative).
         minimum_line_m: narrowest line the lithography prints.
         minimum_space_m: narrowest gap it prints.
         die_m: where on the wafer the DOE lies (y, x).

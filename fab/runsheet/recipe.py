@@ -114,7 +114,7 @@ def _printing(
         Action(
             "Edge bead",
             f"Take the resist off the rim, no farther in than the {format_length(rim_m)} that hold nothing: a bead "
-            "keeps the plate away from the resist, and every line prints wider.",
+            "keeps the plate away from the resist, and lines print with other widths.",
             ("width (mm)",),
         ),
         Action(
@@ -126,7 +126,7 @@ def _printing(
         Action("Align", align),
         Action(
             "Expose",
-            "Vacuum contact. The wafer is transparent: light that the chuck reflects comes back and widens lines. Put "
+            "Vacuum contact. The wafer is transparent: light that the chuck reflects comes back and blurs lines. Put "
             "something matt and black under it, and take the dose from a test exposure on the same glass there.",
             ("wavelength (nm)", "dose (mJ/cm2)"),
         ),

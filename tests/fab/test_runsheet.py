@@ -238,9 +238,9 @@ def test_what_the_process_is_known_to_do_to_depths_is_expected_and_not_undone():
         140 - 10 / 1.04, abs=1e-6
     )
     text = page_of(content).text
-    assert "of which 74.999 nm are expected" in text
+    assert "Target depth 71.4 nm (expected: 74.999 nm)" in text
     assert "next time = expected depth of the next etch / true rate" in text
-    assert "are expected: what the process" not in page_of(record(sheet())).text
+    assert "(expected:" not in page_of(record(sheet())).text
 
 
 def test_depth_pads_say_what_etch_lag_does():
