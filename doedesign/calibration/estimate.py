@@ -159,7 +159,8 @@ def calibrate(
         measurement = read_measurement(Path(measurement), design.camera)
     if design.camera.beam is not None:
         log.warning("the measurement's source lights the plate evenly: the beam of the design is left out")
-    writing = results_folder(out, design.name, design.folder, light=design.camera.light)
+    about = {"level_map_sha256": design.level_map.digest, "light": design.camera.light}
+    writing = results_folder(out, design.name, design.folder, **about)
     # Usually seven rounds of derivatives and a step.
     with writing as fresh, models_meter("calibration", 7 * (len(unknowns.names) + 1)) as on_model:
         result = _calibrated(design, unknowns, measurement, evaluations, polish, seed, on_model)

@@ -66,12 +66,14 @@ def psfs(
     camera = camera_from_spec(run.spec)
     near, far = _near_and_far(run.spec, depths_m)
     designs = _heights_of(run, masks)
-    certified = certified_orders(run.folder, level_map_of_run(run).digest)
+    digest = level_map_of_run(run).digest
+    certified = certified_orders(run.folder, digest)
     # What masks draw was just found equal to the level map in every cell, so its light is the same.
     different = [name for name in designs if name != "from_masks"]
     total = len(different) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
     optics: dict[str, Any] = {name: optic_as_drawn(camera, designs[name], depths_m=(*near, *far)) for name in different}
-    with results_folder(out, run.spec.name, run.folder, light=camera.light) as fresh:
+    about = {"level_map_sha256": digest, "light": camera.light}
+    with results_folder(out, run.spec.name, run.folder, **about) as fresh:
         with meter("PSFs", total) as progress:
             done = count(1)
 
