@@ -42,6 +42,7 @@ from doedesign.design.design import Design
 from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_spec
 from fab.errors import CheckFailed
+from fab.files import write_atomic
 from sim.material import refractive_index
 
 HERE = Path(__file__).parent
@@ -278,7 +279,7 @@ def second_wafers(folder: Path, fabs: int = FABS, spec: Path = HERE / "quick.tom
             found += [Outcome(seed, name, wanted[name], first[name], second[name]) for name in wanted]
         lines = ["fab,colour,design,first_wafer,second_wafer"]
         lines += [f"{one.fab},{one.colour},{one.design:.4f},{one.first:.4f},{one.second:.4f}" for one in found]
-        Path("second_wafer.csv").write_text("\n".join(lines) + "\n")
+        write_atomic("second_wafer.csv", ("\n".join(lines) + "\n").encode())
     print(f"\nring:disc ratio at {1e3 * load_spec(spec).scene.near_m[0]:g} mm")
     for one in found:
         first, second = (f"{ratio:.3f} ({100 * off:+.1f} %)" for ratio, off in zip(one[3:], one.off(), strict=True))

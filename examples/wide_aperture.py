@@ -23,8 +23,6 @@ network, loss and Adam's step are its own. Work that was stopped goes on with th
 """
 
 import argparse
-import csv
-import io
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -59,7 +57,7 @@ from doedesign.training.loss import adam_step, losses
 from doedesign.training.scores import mean_and_interval, paired_difference, psnr
 from fab.archive import read_archive, write_archive
 from fab.figure import SMALL, panels, save
-from fab.files import canonical_json, write_atomic
+from fab.files import canonical_json, csv_table, write_atomic
 from sim.camera import Camera
 from sim.imaging.filtering import common_filter, photograph_spectrum, transfers
 from sim.imaging.parts import ApertureParts, aperture_parts
@@ -494,7 +492,7 @@ def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
             made = Bench(kind, plan.size, folder / f"draw_{number}", partial(_fabricated, kind, design, number))
             found, shown["plate, fabricated"] = judge(bench, network, seen, plan, f"fabricated {number}", (1.0,), made)
             rows += found
-        write_scores(out / "scores.csv", rows)
+        write_atomic(out / "scores.csv", csv_table(rows, 6).encode())
     found = summary_of(rows)
     write_atomic(out / "summary.json", canonical_json(found))
     draw(out / "wide_aperture.png", seen, shown, edge)
@@ -511,15 +509,6 @@ def _fabricated(kind: CameraKind, design: Design, number: int) -> CellOptic:
     return replace(design, camera=camera).fabricated(
         seed=0, draw=f"normal/{number}", depths=(min(depths_of(spec)), np.inf)
     )
-
-
-def write_scores(path: Path, rows: Sequence[Judged]) -> None:
-    """Write the scores of all pictures."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Judged._fields)
-    writer.writerows([*row[:-1], f"{row.psnr:.4f}"] for row in rows)
-    write_atomic(path, text.getvalue().encode())
 
 
 def main() -> int:

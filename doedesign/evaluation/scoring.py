@@ -22,7 +22,7 @@ from doedesign.evaluation.methods import METHODS, MethodInputs
 from doedesign.evaluation.pairs import PairSet
 from doedesign.evaluation.plates import PlateBanks
 from doedesign.training.distance.perceptual import Lpips
-from doedesign.training.scores import scores
+from doedesign.training.scores import scores_of_one
 from sim.light import srgb_from_linear
 
 RowScores = dict[str, dict[str, float | None]]
@@ -58,15 +58,7 @@ class PairWork:
         found = {}
         for one in asked:
             picture = self.picture(number, one)
-            judged = scores(picture[None], reference[None], mask[None], self.lpips)
-            found[one.key] = {
-                region: {
-                    name: float(values[0]) if np.isfinite(values[0]) else None
-                    for name, values in of_region._asdict().items()
-                    if values is not None
-                }
-                for region, of_region in judged._asdict().items()
-            }
+            found[one.key] = scores_of_one(picture, reference, mask, self.lpips)
         return found
 
     def picture(self, number: int, one: Candidate) -> Float[np.ndarray, "c y x"]:

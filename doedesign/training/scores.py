@@ -74,6 +74,24 @@ def scores(recon: Images, reference: Images, mask: Masks, perceptual: Lpips | No
     )
 
 
+def scores_of_one(
+    recon: Float[np.ndarray, "c y x"],
+    reference: Float[np.ndarray, "c y x"],
+    mask: Float[np.ndarray, "y x"],
+    perceptual: Lpips | None = None,
+) -> dict[str, dict[str, float | None]]:
+    """Judge one reconstruction (`scores`): numbers by region and name for JSON, None for one that is not finite."""
+    found = scores(recon[None], reference[None], mask[None], perceptual)
+    return {
+        region: {
+            name: float(values[0]) if np.isfinite(values[0]) else None
+            for name, values in of_region._asdict().items()
+            if values is not None
+        }
+        for region, of_region in found._asdict().items()
+    }
+
+
 def occluded(mask: Masks) -> Bool[Array, "b y x"]:
     """The occluded region: where at least half of a pixel is blocked."""
     return jnp.asarray(mask) >= 0.5

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from doedesign.capture.images import picture_files
 from doedesign.report.sheet import ValidationRow
 from doedesign.training.distance.perceptual import Lpips
-from doedesign.training.scores import scores
+from doedesign.training.scores import scores_of_one
 from fab.errors import InputError
 from fab.files import explain_os_error, sha256_file
 
@@ -109,7 +109,7 @@ def judge(
     """Judge scenes with their pictures; `to_rgb` turns the camera's colours into red, green and blue to look at."""
     scenes, found, rows = [], [], []
     for look in looks:
-        judged = {name: _scores_of(image, look, lpips) for name, image in look.shown.items()}
+        judged = {name: scores_of_one(image, look.scene, look.mask, lpips) for name, image in look.shown.items()}
         found.append(judged)
         scenes.append({"name": look.name, "covered": float(look.mask.mean(dtype=np.float64)), **judged})
         if len(rows) < _MOST_ROWS:
@@ -123,18 +123,6 @@ def judge(
         for kind, of_kind in found[0].items()
     }
     return EvaluationResult(means, scenes, rows)
-
-
-def _scores_of(image: np.ndarray, look: HeldOutScene, lpips: Lpips | None) -> dict[str, dict[str, float | None]]:
-    """Scores of one picture for JSON; None where there is none."""
-    return {
-        region: {
-            name: float(values[0]) if np.isfinite(values[0]) else None
-            for name, values in of_region._asdict().items()
-            if values is not None
-        }
-        for region, of_region in scores(image[None], look.scene[None], look.mask[None], lpips)._asdict().items()
-    }
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
