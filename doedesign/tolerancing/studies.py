@@ -6,6 +6,7 @@ from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -255,6 +256,7 @@ def _with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
     """A process with some errors changed as in `study`."""
     from doedesign.spec import ErrorsSpec, process_from_json, validated
 
+    _require_units(errors)
     in_si = {name: value for name, value in errors.items() if name in DEVIATIONS and DEVIATIONS[name].unit != "1"}
     read = validated(ErrorsSpec, {name: value for name, value in errors.items() if name not in in_si}, "errors")
     levels = {"levels": process.levels.count, "level_step_m": process.levels.step_m}
@@ -264,6 +266,18 @@ def _with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
         names = error_names(process.masks, key)
         spreads |= dict(zip(names, given.spreads(len(names)), strict=True))
     return replace(process, spreads=spreads)
+
+
+def _require_units(errors: Mapping[str, Any]) -> None:
+    """Raise an `InputError` for a bare number under the name of an error that has a unit."""
+    for key, value in errors.items():
+        unit = next((unit for unit in ("m", "rad") if f"{key}_{unit}" in DEVIATIONS), None)
+        numbers = [value.get(part) for part in ("mean", "sigma")] if isinstance(value, Mapping) else [value]
+        if unit is None or not any(isinstance(number, Real) for number in numbers):
+            continue
+        name, example = f"{key}_{unit}", '"0.5 um"' if unit == "m" else '"2 deg"'
+        rule = f"must be text with a unit such as {example}; a number goes by the name `{name}`"
+        raise InputError(f"errors: {key}", rule, value, f'Write {{"{name}": {value}}}, or give a unit.')
 
 
 def _runner(design: "Design", workers: int | None, scheduler: str | None, in_memory: bool) -> Any:
