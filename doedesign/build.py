@@ -26,17 +26,24 @@ from fab.order.terms import OrderTerms
 from fab.pictures import read_pixels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from fab.stock import IDEAL, STOCK, process_from
+from fab.units import format_length
 from sim.camera import Camera, Colour
-from sim.illumination import Beam, EvenBeam, GaussianBeam, MeasuredBeam
+from sim.illumination import Beam, EvenBeam, GaussianBeam, MeasuredBeam, power_through
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
 _SHARED = ("tone", "minimum_line_m", "minimum_space_m", "die_m", "wafer_radius_m")
+# Share of a beam's power that the aperture must let through; fields of single precision hold no less of it than this.
+_LEAST_POWER = 1e-9
 _EVENTS = ("particles_per_m2", "pinholes_per_m2", "missed", "doubled")
 
 
 def camera_from_spec(spec: Spec) -> Camera:
-    """Return lens, sensor, substrate and DOE grid of a spec."""
-    return Camera(
+    """Return lens, sensor, substrate and DOE grid of a spec.
+
+    Raises:
+        InputError: a beam whose picture cannot be used, or that misses the aperture.
+    """
+    camera = Camera(
         grid=Grid(spec.doe.shape, spec.doe.pitch_m),
         # Light passes the opening in the chrome, which is smaller than what is etched.
         aperture=spec.doe.relief.shrunk(spec.process.chrome_overlap_m),
@@ -55,6 +62,21 @@ def camera_from_spec(spec: Spec) -> Camera:
         beam=beam_from_spec(spec),
         distance_m=np.inf if spec.sensor.in_angles else spec.sensor.distance_m,
     )
+    _require_light(camera)
+    return camera
+
+
+def _require_light(camera: Camera) -> None:
+    """Raise an `InputError` for a beam beside the aperture: of no light there are no shares."""
+    if camera.beam is None:
+        return
+    for colour in camera.colours:
+        share = power_through(camera.beam, camera.grid, camera.opening, colour.wavelengths_m[0])
+        if not share >= _LEAST_POWER:
+            rule = f"light of the beam must reach the aperture of {camera.opening}"
+            got = f"{share:.2g} of its power there at {format_length(colour.wavelengths_m[0])}"
+            cure = 'Move it, for example centre = ["0 mm", "0 mm"], or choose a wider one.'
+            raise InputError("illumination.centre", rule, got, cure)
 
 
 def beam_from_spec(spec: Spec) -> Beam | None:

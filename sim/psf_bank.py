@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Table = Float[np.ndarray, "w d"] | Float[Array, "w d"]
 Length = float | str
+_WIDEST_RAD = np.pi / 3  # of a field angle
 if TYPE_CHECKING:  # numpy and jax arrays serve alike
     Energies = Any
 else:
@@ -237,6 +238,23 @@ def depths_from(depths: Length | Sequence[Length]) -> tuple[float, ...]:
     return found
 
 
+def field_from(field_rad: Any) -> tuple[float, float]:
+    """Field angles (y, x), radians, as two floats.
+
+    Raises:
+        InputError: something other than two numbers, or an angle beyond 60 degrees.
+    """
+    try:
+        # "12" would be the two angles 1 and 2.
+        found = () if any(isinstance(angle, str) for angle in field_rad) else tuple(map(float, field_rad))
+    except (TypeError, ValueError):  # no sequence, or no numbers; jax raises the former for what it traces
+        found = ()
+    if len(found) != 2 or not all(abs(angle) <= _WIDEST_RAD for angle in found):
+        rule = f"must be two angles (y, x) within {_WIDEST_RAD:.4g} radians, 60 degrees"
+        raise InputError("field_rad", rule, str(field_rad), "A thin lens says nothing beyond. For example (0.0, 0.1).")
+    return found
+
+
 def psf(
     optic: Any,
     camera: Camera | None = None,
@@ -267,9 +285,10 @@ def psf(
 
     Raises:
         ValueError: a height map that does not match its camera, or what the optic cannot do.
-        InputError: a wavelength outside the material's range, or eq. 6 violated on a direct path.
+        InputError: a wavelength outside the material's range, eq. 6 violated on a direct path, or depths or field
+            angles that cannot be used.
     """
-    depths_m = depths_from(depths)
+    depths_m, field_rad = depths_from(depths), field_from(field_rad)
     chosen = optic_of(optic, camera, depths_m)
     traced = is_traced(chosen) or in_jit()
 

@@ -245,16 +245,30 @@ class AreaTables:
 
 def areas_of_design(design: Design, doe: CellOptic) -> tuple[AreaTable, ...]:
     """Light on each of the areas of a design's spec, of the design as drawn or as fabricated."""
-    spec, tables = design.spec, []
+    assert design.spec is not None
+    tables = []
+    for area, target in zip(design.spec.areas, targets_of_design(design), strict=True):
+        seen = doe if area.distance_m is None else doe.with_camera(in_plane(area, doe.camera))
+        tables.append(area_table(seen, target, colour_number(area, doe.camera)))
+    return tuple(tables)
+
+
+def targets_of_design(design: Design) -> tuple[AreaTarget, ...]:
+    """The areas of a design's spec, on lattices as fine as their light is looked at; those that it holds, if any.
+
+    Raises:
+        InputError: a picture that is missing or cannot be drawn.
+    """
+    if design.area_targets:
+        return design.area_targets
+    spec, targets = design.spec, []
     assert spec is not None
     for index, area in enumerate(spec.areas):
         key = spec.area_key(index)
         picture = input_files(spec, f"{key}.picture")[f"{key}.picture"] if area.picture else None
         phase = input_files(spec, f"{key}.phase")[f"{key}.phase"] if area.phase_picture else None
-        target = AreaTarget.of(area, camera_for(area, design.camera), picture, phase, samples=_SAMPLES)
-        seen = doe if area.distance_m is None else doe.with_camera(in_plane(area, doe.camera))
-        tables.append(area_table(seen, target, colour_number(area, doe.camera)))
-    return tuple(tables)
+        targets.append(AreaTarget.of(area, camera_for(area, design.camera), picture, phase, samples=_SAMPLES))
+    return tuple(targets)
 
 
 def area_table(doe: CellOptic, target: AreaTarget, colour: int = 0) -> AreaTable:

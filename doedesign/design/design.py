@@ -47,6 +47,8 @@ class Design:
         spec: the spec it was optimised for, if there was one.
         history: one record per step of its optimisation, if at hand: `step`, `loss`, `terms` and their `names`.
         folder: its run folder, if it has one.
+        area_targets: the areas of its spec with their pictures read, as `doedesign.areas.target.AreaTarget`, for
+            processes that may not have the files; empty where they are read from these.
     """
 
     level_map: LevelMap
@@ -59,6 +61,7 @@ class Design:
     spec: Spec | None = None
     history: tuple[Mapping[str, Any], ...] = ()
     folder: Path | None = None
+    area_targets: tuple[Any, ...] = ()  # a module that builds on this one has the class
 
     @property
     def name(self) -> str:
@@ -93,8 +96,12 @@ class Design:
         return optic_as_drawn(self.camera, self.height_m, depths_m=self.depths_m or (np.inf,))
 
     def bare(self) -> "Design":
-        """The same without what only its optimisation knew: what other processes need to predict it."""
-        return replace(self, continuous_m=None, spec=None, history=(), folder=None)
+        """The same without what only its optimisation knew: what other processes need to predict it.
+
+        Its spec stays where it says what light should make.
+        """
+        spec = self.spec if self.spec is not None and self.spec.aims else None
+        return replace(self, continuous_m=None, spec=spec, history=(), folder=None)
 
     def process(self, process: "Process | str | Path | None" = None) -> Process:
         """Return the process that makes this design, as the design sees it through its masks.

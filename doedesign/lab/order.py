@@ -33,6 +33,7 @@ from fab.order.write import WrittenOrder, write_planned
 from fab.process import Process, Variation
 from fab.runsheet.tables import SheetPrediction
 from fab.solids.patch import Patch
+from fab.units import metres
 
 log = logging.getLogger("doedesign")
 
@@ -43,7 +44,7 @@ def write_masks(
     *,
     levels: int | None = None,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
-    probe_m: float = PROBE_M,
+    probe_m: float | str = PROBE_M,
     patch: Patch | None = None,
     process: Process | str | Path | None = None,
     wafer: Wafer | str | Path | None = None,
@@ -60,7 +61,7 @@ def write_masks(
         out: order folder; `masks/NAME` by default. An order in it is replaced if it is of the same run or level map.
         levels: number of heights; the run's own by default.
         on_violation: what to do where the process cannot print a mask: say so, refuse, or change the level map.
-        probe_m: wavelength of the laser that the lab tests the DOE with, metres.
+        probe_m: wavelength of the laser that the lab tests the DOE with, in metres or with a unit.
         patch: a window to write as a solid at full resolution, too.
         process: a process, the name of a stock process or a TOML file; that of the run, or an ideal one, by default.
         wafer: the wafer to fill, or a TOML file with it; that of the run, or the usual one, by default.
@@ -77,6 +78,7 @@ def write_masks(
             cannot be written or has the order of another design.
         CheckFailed: what was read back differs from what was asked for; nothing is left behind.
     """
+    probe_m = metres(probe_m, "probe_m")
     level_map, origin, design = drawing_from(source, levels, **geometry)
     spec = None if design is None else design.spec
     run = None if design is None else design.folder

@@ -30,7 +30,7 @@ from sim.optic import HeightOptic, RingOptic
 from sim.plots.curves import encircled_curves, plot_encircled, plot_mtf
 from sim.plots.psfs import plot_psfs
 from sim.propagation.hankel import radial_profile, ring_count
-from sim.psf_bank import PsfBank, psf
+from sim.psf_bank import PsfBank, depths_from, field_from, psf
 from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
 from sim.store import write_bank
 from sim.transfer import mtf
@@ -41,7 +41,7 @@ log = logging.getLogger("doedesign")
 def psfs(
     run: Run | str | Path,
     masks: str | Path | None = None,
-    depths_m: Sequence[float] = (),
+    depths_m: str | float | Sequence[str | float] = (),
     field_rad: tuple[float, float] = (0.0, 0.0),
     out: str | Path | None = None,
 ) -> dict[str, PsfBank]:
@@ -50,8 +50,8 @@ def psfs(
     Args:
         run: a finished run, or its folder.
         masks: its mask order; `masks/NAME` if there is one.
-        depths_m: source depths, metres; those of the spec by default.
-        field_rad: field angles (y, x), radians.
+        depths_m: source depths, in metres or with a unit ("5 m", "inf"); those of the spec by default.
+        field_rad: field angles (y, x), radians, within 60 degrees.
         out: folder for the banks, their metrics (SI units) and pictures; with 0th orders of the run's certificate.
 
     Returns:
@@ -59,12 +59,14 @@ def psfs(
         is a mask order.
 
     Raises:
-        InputError: a run, a mask order or depths that cannot be used.
+        InputError: a run, a mask order, depths or field angles that cannot be used.
         CheckFailed: the masks draw something else than the design.
     """
+    field_rad = field_from(field_rad)
+    depths = depths_from(depths_m) if np.size(depths_m) else ()
     run = run if isinstance(run, Run) else open_run(Path(run))
     camera = camera_from_spec(run.spec)
-    near, far = _near_and_far(run.spec, depths_m)
+    near, far = _near_and_far(run.spec, depths)
     designs = _heights_of(run, masks)
     digest = level_map_of_run(run).digest
     certified = certified_orders(run.folder, digest)

@@ -124,10 +124,10 @@ def load_process(path: str | Path, levels: Levels | None = None) -> ProcessSpec:
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
-    if not Path(path).suffix and not Path(path).exists():
+    if path == "" or (not Path(path).suffix and not Path(path).exists()):
         names = ", ".join((*STOCK, IDEAL.name))
         rule = "must be a file with a [process] table or the name of a process"
-        raise InputError(str(path), rule, "neither", f"Names are {names}.")
+        raise InputError(str(path) or "process", rule, "neither" if path else '""', f"Names are {names}.")
     return _load(ProcessFile, path, "process", {} if levels is None else {"process": _staircase(levels)}).process
 
 
@@ -230,8 +230,8 @@ def kept_pictures(spec: Spec) -> dict[str, str]:
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
     """Read the tables of a TOML file; `what` it should hold ("a spec") and an `example` of that are for messages."""
     cure = f"Give {what} such as {example}."
-    beside = path.with_name(f"{path.name}.toml")
-    if path.name and not path.exists() and beside.is_file():
+    beside = path.with_name(f"{path.name}.toml") if path.name else path
+    if not path.exists() and beside.is_file():
         raise InputError(str(path), "the file must exist", "nothing of that name", f"Did you mean {beside}?")
     content = read_bytes(path, 1 << 24)
     try:

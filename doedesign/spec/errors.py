@@ -186,8 +186,10 @@ def _model(field: FieldInfo) -> type[SpecTable] | None:
 
 
 def _keys(table: type[SpecTable]) -> list[str]:
-    keys = [toml_key(name) for name in table.model_fields]
-    return [*keys, "wavelengths", *RESPONSE_KEYS] if "colours" in keys else keys
+    """Keys that a table takes; where colours are tables, there are short forms of them."""
+    colours = table.model_fields.get("colours")
+    short = ("wavelengths", *RESPONSE_KEYS) if colours and _model(colours) else ()
+    return [*(toml_key(name) for name in table.model_fields), *short]
 
 
 def _tables(root: type[SpecTable], path: str = "") -> Iterator[tuple[str, type[SpecTable]]]:

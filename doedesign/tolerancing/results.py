@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from doedesign.runs.folder import Run
 from doedesign.spec import LimitSpec
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from doedesign.design.design import Design
 
 log = logging.getLogger("doedesign")
+
+Sensitivity = Literal["one_at_a_time", "sobol", "none"]
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ def tolerance(
     errors: Mapping[str, Any] | None = None,
     limits: Sequence[str | LimitSpec] | None = None,
     draws: int = 100,
-    sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time",
+    sensitivity: Sensitivity = "one_at_a_time",
     sobol: int = 64,
     corners: bool = False,
     budget: str | None = None,
@@ -184,6 +186,9 @@ def tolerance(
     Raises:
         InputError: something that cannot be used; see `study`.
     """
+    if sensitivity not in get_args(Sensitivity):
+        rule = f"must be one of {', '.join(get_args(Sensitivity))}"
+        raise InputError("sensitivity", rule, repr(sensitivity), "Choose one of them.")
     settings: dict[str, Any] = {"process": process, "errors": errors, "limits": limits, "seed": seed, "masks": masks}
     where: dict[str, Any] = {"out": out, "workers": workers, "scheduler": scheduler, "evaluate": evaluate}
     asked = study(design, **settings, **where)

@@ -6,6 +6,7 @@ from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -245,15 +246,17 @@ def study(
     given = limits if limits is not None else design.spec.limits if design.spec else ()
     given = [given] if isinstance(given, str) else given
     obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in given)
-    journal = Journal(None if out is None else Path(out), _identity(design, made, seed, evaluate), DrawLines())
+    bare = _for_workers(design)
+    journal = Journal(None if out is None else Path(out), _identity(bare, made, seed, evaluate), DrawLines())
     run = _runner(design, workers, scheduler, out is None)
-    return Study(design.bare(), made, obeyed, seed, journal, evaluate, run, quiet)
+    return Study(bare, made, obeyed, seed, journal, evaluate, run, quiet)
 
 
 def _with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
     """A process with some errors changed as in `study`."""
     from doedesign.spec import ErrorsSpec, process_from_json, validated
 
+    _require_units(errors)
     in_si = {name: value for name, value in errors.items() if name in DEVIATIONS and DEVIATIONS[name].unit != "1"}
     read = validated(ErrorsSpec, {name: value for name, value in errors.items() if name not in in_si}, "errors")
     levels = {"levels": process.levels.count, "level_step_m": process.levels.step_m}
@@ -263,6 +266,18 @@ def _with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
         names = error_names(process.masks, key)
         spreads |= dict(zip(names, given.spreads(len(names)), strict=True))
     return replace(process, spreads=spreads)
+
+
+def _require_units(errors: Mapping[str, Any]) -> None:
+    """Raise an `InputError` for a bare number under the name of an error that has a unit."""
+    for key, value in errors.items():
+        unit = next((unit for unit in ("m", "rad") if f"{key}_{unit}" in DEVIATIONS), None)
+        numbers = [value.get(part) for part in ("mean", "sigma")] if isinstance(value, Mapping) else [value]
+        if unit is None or not any(isinstance(number, Real) for number in numbers):
+            continue
+        name, example = f"{key}_{unit}", '"0.5 um"' if unit == "m" else '"2 deg"'
+        rule = f"must be text with a unit such as {example}; a number goes by the name `{name}`"
+        raise InputError(f"errors: {key}", rule, value, f'Write {{"{name}": {value}}}, or give a unit.')
 
 
 def _runner(design: "Design", workers: int | None, scheduler: str | None, in_memory: bool) -> Any:
@@ -296,6 +311,33 @@ def _given(camera: Camera) -> dict[str, Any]:
     return {**given, "aperture_m": camera.opening.record()}
 
 
+def _for_workers(design: "Design") -> "Design":
+    """A design as small as it can be sent with every draw, and with the pictures of its areas read.
+
+    Raises:
+        InputError: a picture that is missing or cannot be drawn.
+    """
+    bare = design.bare()
+    if bare.spec is None or not bare.spec.areas:
+        return bare
+    from doedesign.areas.shape import targets_of_design
+
+    return replace(bare, area_targets=targets_of_design(bare))
+
+
+def _target(design: "Design") -> dict[str, Any]:
+    """Record of what light should make: the tables of the spec and digests of pictures; empty for nothing."""
+    spec = design.spec
+    if spec is None or not spec.aims:
+        return {}
+    tables = [("focus", spec.focus), ("spots", spec.spots), *(("area", area) for area in spec.areas)]
+    asked = [{name: one.model_dump(mode="json", exclude_defaults=True)} for name, one in tables if one is not None]
+    arrays = [array for one in design.area_targets for array in (one.value, one.phase) if array is not None]
+    drawn = any(area.picture or area.phase_picture for area in spec.areas)
+    pixels = {"pixels_sha256": sha256_bytes(b"".join(array.tobytes() for array in arrays))} if drawn else {}
+    return {"target": {"tables": asked, **pixels}}
+
+
 def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
     """Everything a draw's numbers depend on besides its key, as JSON.
 
@@ -327,4 +369,6 @@ def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate)
         },
         "seed": seed,
         "evaluate": _EARLIER.get(name, name),
+        # Without it where there is none, so that earlier studies go on; earlier ones of spots had no numbers of spots.
+        **_target(design),
     }

@@ -309,8 +309,11 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
         process: rules; or a process, or the name of a stock process, whose narrowest line and space are the rules.
 
     Raises:
-        InputError: a process of another staircase, or one of an unknown name.
+        InputError: no level map, a process of another staircase, or one of an unknown name.
     """
+    if not isinstance(level_map, LevelMap):
+        kind = type(level_map).__name__
+        raise InputError("level_map", "must be a LevelMap", f"a {kind}", "A design has one: design.level_map.")
     levels = level_map.levels
     rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
     grid, relief = level_map.grid, level_map.relief

@@ -19,7 +19,7 @@ import io
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ from fab.units import MM, format_length
 _FEWEST_ZEMAX = 5
 _SAG_CELLS = 500
 _ROWS = 256
+Side = Literal["exit", "entry"]  # by which light leaves or enters
 
 _Read = Callable[[Path], NDArray[Any]]
 
@@ -104,7 +105,7 @@ def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 
     return scale_m
 
 
-def _sag_lines(levels: Levels, side: Literal["exit", "entry"] = "exit") -> list[str]:
+def _sag_lines(levels: Levels, side: Side = "exit") -> list[str]:
     """Return the line of a point of every level."""
     heights = levels.heights_m()
     sag_mm = (heights - heights.max()) / MM * (1 if side == "exit" else -1)
@@ -116,7 +117,7 @@ def _sag_lines(levels: Levels, side: Literal["exit", "entry"] = "exit") -> list[
 
 
 def write_zemax_sag(
-    path: str | Path, level_map: LevelMap, window: PixelWindow | None = None, side: Literal["exit", "entry"] = "exit"
+    path: str | Path, level_map: LevelMap, window: PixelWindow | None = None, side: Side = "exit"
 ) -> None:
     """Write the relief as a grid sag of Zemax OpticStudio (millimetres, file suffix .DAT).
 
@@ -133,7 +134,7 @@ def write_zemax_phase(
     level_map: LevelMap,
     waves_per_metre: float,
     window: PixelWindow | None = None,
-    side: Literal["exit", "entry"] = "entry",
+    side: Side = "entry",
 ) -> None:
     """Write the phase of the relief as a grid phase of Zemax OpticStudio (radians, file suffix .DAT).
 
@@ -153,10 +154,11 @@ def write_zemax_phase(
     _write_grid(Path(path), level_map, [f"{radians:14.9f} 0 0 0 0\r\n" for radians in phase], window, side)
 
 
-def _write_grid(
-    path: Path, level_map: LevelMap, lines: list[str], window: PixelWindow | None, side: Literal["exit", "entry"]
-) -> None:
+def _write_grid(path: Path, level_map: LevelMap, lines: list[str], window: PixelWindow | None, side: Side) -> None:
     """Write a grid of OpticStudio from the line of a point of every level."""
+    if side not in get_args(Side):
+        rule = f"the relief must be on one of the faces {', '.join(get_args(Side))}"
+        raise InputError("side", rule, repr(side), "Choose one of them.")
     if path.suffix.upper() != ".DAT":
         raise InputError(str(path), "OpticStudio reads grids from .DAT files", path.suffix, "Use .DAT.")
     grid = level_map.grid

@@ -240,6 +240,13 @@ def test_a_plate_with_errors_is_followed(spec_file: Path):
     assert made["focus_width"] == pytest.approx(drawn["focus_width"], abs=0.05)
 
 
+def test_one_distance_for_several_colours_is_no_focus_twice(spec_file: Path):
+    distances, colours = 'focus.distances=["4 mm","4 mm"]', 'focus.colours=["640nm","532nm"]'
+    spec = doedesign.load_spec(spec_file, [*COLOURS, distances, colours])
+    assert spec.focus is not None
+    assert spec.focus.distances_m == (4e-3, 4e-3)
+
+
 @pytest.mark.parametrize(
     ("overrides", "key", "rule"),
     [
@@ -257,6 +264,12 @@ def test_a_plate_with_errors_is_followed(spec_file: Path):
             ['focus.distances=["40 mm"]', 'focus.widths=["20 um"]'],
             "focus.widths[0]",
             "focuses light to 47.9 um at least",
+        ),
+        (['focus.distances=["4 mm","3 mm","4 mm"]'], "focus.distances[2]", "must differ"),
+        (
+            [*COLOURS, 'focus.distances=["4 mm","4 mm"]', 'focus.colours=["640nm","640nm"]'],
+            "focus.distances[1]",
+            "foci of one colour must differ",
         ),
         (['scene.far=["1 m"]'], "scene.far", "collimated"),
         ([*BEAM, "illumination.m_squared=1.4"], "illumination.m_squared", "a single mode"),

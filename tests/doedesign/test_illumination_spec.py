@@ -13,11 +13,14 @@ from doedesign.runs.folder import open_run
 from doedesign.spec import Spec, load_spec, spec_digest, spec_to_toml, spec_warnings
 from doedesign.spots.design import spots_from_spec
 from doedesign.spots.orders import order_table
+from fab.aperture import RectangularAperture
 from fab.errors import InputError
+from fab.grid import Grid
 from fab.pictures import write_pixels
 from fab.units import parse_angle
-from sim.illumination import EvenBeam, GaussianBeam, MeasuredBeam
+from sim.illumination import EvenBeam, GaussianBeam, MeasuredBeam, power_through
 from sim.optic import HeightOptic
+from sim.psf_bank import psf
 from sim.transfer import mtf
 from tests.doedesign.test_spots_run import SPEC
 from tests.pictures import leave_out_pictures
@@ -167,6 +170,43 @@ def test_a_black_or_missing_picture_is_refused(tmp_path: Path):
     write_pixels(tmp_path / "beam.png", np.zeros((8, 8), np.uint16))
     with pytest.raises(InputError, match="must have some light"):
         optimize(spec_of(tmp_path, PICTURE))
+
+
+BESIDE = 'illumination.centre=["5 mm", "0 mm"]'
+NARROW = GAUSSIAN.replace('["120 um", "100 um"]', '"100 um"')
+
+
+@pytest.mark.parametrize("more", [[], ["illumination.m_squared=2.0"], ['illumination.waist_distance="20 mm"']])
+def test_a_beam_beside_the_aperture_is_refused(tmp_path: Path, more: list[str]):
+    """Its shares of light would be nothing over nothing."""
+    with pytest.raises(InputError, match=r"illumination\.centre: light of the beam must reach the aperture"):
+        optimize(spec_of(tmp_path, NARROW, BESIDE, *more))
+    beam_picture(tmp_path / "beam.png")
+    with pytest.raises(InputError, match=r"illumination\.centre: light of the beam must reach the aperture"):
+        camera_from_spec(spec_of(tmp_path, PICTURE, BESIDE))
+
+
+def test_little_light_of_a_beam_is_enough(tmp_path: Path):
+    """A few millionths of a percent of the power: numbers are finite and say how little it is."""
+    centre = 'illumination.centre=["235 um", "0 um"]'
+    spots = 'spots={ count = [3, 3], spacing = "500 um", starts = 8 }'
+    design = optimize(spec_of(tmp_path, NARROW, centre, spots, "optimize.steps=2"))
+    camera = design.camera
+    assert camera.beam is not None
+    share = power_through(camera.beam, camera.grid, camera.opening, 532e-9)
+    assert 1e-9 < share < 1e-8
+    energy = psf(design.as_optic()).energy
+    assert np.isfinite(energy).all()
+    assert 0 < energy.sum() < share
+    assert np.isfinite([row["loss"] for row in design.history]).all()
+
+
+def test_power_through_an_aperture_is_that_of_the_whole_beam(tmp_path: Path):
+    """A beam of several modes, its axis on a side of a wide aperture: half of its light passes."""
+    grid = Grid((256, 256), 4e-6)
+    for beam in (GaussianBeam((40e-6, 40e-6), 0.0, (2.0, 2.0), (0.0, 0.512e-3)), GaussianBeam((40e-6, 40e-6))):
+        share = power_through(beam, grid, RectangularAperture((1.024e-3, 1.024e-3)), 532e-9)
+        assert share == pytest.approx(0.5 if any(beam.centre_m) else 1.0, rel=1e-3)
 
 
 def test_spots_of_a_gaussian_beam_are_equal(tmp_path: Path):

@@ -240,6 +240,12 @@ REFUSED = [
     ("objective.0.name", '"far_spott"', ["objective[0].name", "a known objective", "Did you mean `far_spot`?"]),
     ("objective.0.weight", "inf", ["objective[0].weight", "must be finite"]),
     ("name", '"a/b"', ["name", "must be a file name", 'got "a/b"']),
+    # The short forms of colours belong to [optics], whatever tables choose among its colours.
+    ("optimize.wavelengths", '["532 nm"]', ["known key of [optimize]", "It belongs to [optics]."]),
+    ("optics.wavelenghts", "[]", ["known key of [optics]", "Did you mean `wavelengths`?"]),
+    ("optics.lines", "3", ["known key of [optics]", "spectral_response, lines_per_colour."]),
+    ("optimize.foo", "1", ["known key of [optimize]", "checkpoint_every."]),
+    ("objective.0.foo", "1", ["known key of [objective[0]]", "over."]),
     ("lens", "{}", ["lens", "must be a known key of the spec", "`lens`"]),
     ("scene", "3", ["scene", "must be a table", "got 3"]),
 ]

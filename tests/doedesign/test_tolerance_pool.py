@@ -24,6 +24,7 @@ import pytest
 from doedesign.runtime.pool import default_workers
 from doedesign.tolerancing import studies as studies_module
 from doedesign.tolerancing.pool import BYTES_PER_CELL, DrawModel
+from doedesign.tolerancing.results import tolerance
 from doedesign.tolerancing.studies import Study, study
 from fab.aperture import RectangularAperture
 from fab.draws import normal_keys
@@ -195,6 +196,20 @@ def with_digest(line: bytes) -> bytes:
     values = json.loads(line)
     digest = sha256_bytes(json.dumps(values, sort_keys=True).encode())[:16]
     return json.dumps({**values, "sha256": digest}).encode()
+
+
+@pytest.mark.parametrize(
+    ("errors", "name"), [({"overlay_x": 5e-7}, "overlay_x_m"), ({"sidewall": {"sigma": 0.01}}, "sidewall_rad")]
+)
+def test_a_number_without_a_unit_is_told_its_name(ask: Callable[..., Study], errors: dict[str, Any], name: str):
+    with pytest.raises(InputError, match=f"a number goes by the name `{name}`"):
+        ask(errors=errors)
+    assert ask(errors={"overlay_x_m": 5e-7}).process.spreads["overlay_x_m[0]"].sigma == 5e-7
+
+
+def test_a_sensitivity_of_an_unknown_name_is_refused(fakes: ModuleType):
+    with pytest.raises(InputError, match="sensitivity: must be one of one_at_a_time, sobol, none, but got 'foo'"):
+        tolerance(fakes.design(), process=fakes.process(), evaluate=fakes.rows, sensitivity=cast(Any, "foo"))
 
 
 def test_draws_with_other_rows_are_refused(ask: Callable[..., Study], tmp_path: Path):

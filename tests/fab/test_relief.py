@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import tifffile
@@ -125,6 +127,13 @@ def test_a_grid_phase_is_positive_where_there_is_more_glass(tmp_path, side):
     assert np.allclose(radians, 2 * np.pi * 0.46 / 550e-9 * 75e-9 * level_map.level, rtol=0, atol=6e-10)
     with pytest.raises(InputError, match="DAT"):
         write_zemax_phase(tmp_path / "p.txt", level_map, 1e6)
+
+
+@pytest.mark.parametrize("write", [write_zemax_sag, partial(write_zemax_phase, waves_per_metre=1e6)])
+def test_a_relief_is_on_one_of_two_faces(tmp_path, write):
+    with pytest.raises(InputError, match="side: the relief must be on one of the faces exit, entry, but got 'foo'"):
+        write(tmp_path / "p.DAT", some_map(), side="foo")
+    assert not (tmp_path / "p.DAT").exists()
 
 
 def test_a_window_of_a_grid_sag_lies_where_it_is_on_the_plate(tmp_path):

@@ -9,7 +9,7 @@ from sim.camera import Colour
 from sim.optic import HeightOptic
 from sim.propagation.farfield import FarField
 from sim.propagation.fresnel import DirectPath
-from sim.psf_bank import psf
+from sim.psf_bank import field_from, psf
 
 ONE = make_camera(128, 0.3e-3, 0.54e-3, 1.85e-6, 32)
 HEIGHT = wrapped_map(128)
@@ -67,6 +67,21 @@ def test_propagations_by_name():
 def test_depths_are_positive(depths: list[float] | float):
     with pytest.raises(InputError, match="depth"):
         psf(HEIGHT, ONE, depths)
+
+
+@pytest.mark.parametrize("field", [(0.0, 2.0), (0.0, np.nan), (0.1,), ("0.1", "0.2"), "12", 0.1])
+def test_field_angles_are_two_numbers_within_what_a_lens_says(field: object):
+    with pytest.raises(InputError, match=r"field_rad: must be two angles \(y, x\) within 1.047 radians"):
+        field_from(field)
+    assert field_from((0.0, np.pi / 3)) == (0.0, np.pi / 3)
+
+
+def test_field_angles_of_psfs_are_checked_and_kept_as_floats(recwarn: pytest.WarningsRecorder):
+    with pytest.raises(InputError, match="field_rad"):
+        psf(HEIGHT, ONE, field_rad=(0.0, 2.0))
+    bank = psf(HEIGHT, ONE, field_rad=(0.0, np.float64(0.1)))
+    assert [type(angle) for angle in (*bank.field_rad, *field_from([0, np.float32(1)]))] == [float] * 4
+    assert not [one for one in recwarn if "static" in str(one.message)]
 
 
 def test_a_map_of_another_shape_is_refused():

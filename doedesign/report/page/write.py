@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from doedesign.report.page.compare import compared
 from doedesign.report.page.files import work_state
@@ -11,22 +12,26 @@ from doedesign.report.page.render import render
 from fab.errors import InputError
 from fab.files import os_errors_explained, write_atomic
 
+if TYPE_CHECKING:
+    from doedesign.design.design import Design
+    from doedesign.runs.folder import Run
+
 _EVERY_S = 2.0
 # By which a page is known as one, in its first bytes.
 _MARK, _HEAD = b'<meta name="generator" content="doedesign', 2000
 
 
 def write_report(
-    run: str | Path,
+    run: "Design | Run | str | Path",
     *,
-    compare: Sequence[str | Path] = (),
+    compare: "Sequence[Design | Run | str | Path]" = (),
     order: str | Path | None = None,
     out: str | Path | None = None,
 ) -> Path:
     """Write the page of a run: one HTML file that opens from the disk.
 
     Args:
-        run: the run folder, finished or at work.
+        run: the run folder, finished or at work; an open run or a design stands for its folder.
         compare: other runs to put beside it.
         order: its mask order; `masks/NAME` beside the folder of runs, or where the program runs, by default.
         out: the file; report.html in the run's folder by default, comparison.html for several runs.
@@ -35,17 +40,25 @@ def write_report(
         the file.
 
     Raises:
-        InputError: something that is damaged, was changed, or does not belong to the run; `out` is another file than an
-            earlier page.
+        InputError: a design without a folder; something that is damaged, was changed, or does not belong to the run;
+            `out` is another file than an earlier page.
     """
-    folder = Path(run)
-    path = Path(out) if out is not None else folder / ("comparison.html" if compare else "report.html")
+    folder, others = _folder_of(run), [_folder_of(one) for one in compare]
+    path = Path(out) if out is not None else folder / ("comparison.html" if others else "report.html")
     if path.is_file() and not _is_page(path):
         raise InputError(str(path), "a report must not replace another file", "no report", "Choose another place.")
     given = None if order is None else Path(order)
-    content = compared([folder, *map(Path, compare)]) if compare else gather(folder, given)
+    content = compared([folder, *others]) if others else gather(folder, given)
     write_atomic(path, render(content))
     return path
+
+
+def _folder_of(run: "Design | Run | str | Path") -> Path:
+    folder = run if isinstance(run, str | Path) else run.folder
+    if folder is None:
+        cure = "Optimise it into a folder, or give that of its run."
+        raise InputError("run", "a page is written of a run folder", "a design in memory", cure)
+    return Path(folder)
 
 
 def _is_page(path: Path) -> bool:

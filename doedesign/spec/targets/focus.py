@@ -74,9 +74,23 @@ def focus_problems(spec: "Spec") -> Iterator[InputError]:
         other, got = ("sensor.pixel_angle", "angles") if spec.sensor.in_angles else ("optics.focal_length", "a lens")
         cure = f"Give sensor.distance and sensor.pitch instead of {other}."
         yield InputError("sensor.distance", "foci lie behind a DOE without a lens", got, cure)
+    yield from _alike(focus)
     yield from beside_problems(spec, "focus")
     yield from _beam(spec)
     yield from _reach(spec)
+
+
+def _alike(focus: FocusSpec) -> Iterator[InputError]:
+    """The rule that no focus is given twice: each would count the light of both as its own."""
+    if focus.through:
+        return
+    colours = focus.colours or ("",) * len(focus.distances_m)
+    foci = list(zip(focus.distances_m, colours, strict=False))
+    for index, (distance, colour) in enumerate(foci):
+        if (distance, colour) in foci[:index]:
+            rule = "foci of one colour must differ: each would count the other's light as its own"
+            cure = "Remove one; for more light in it, raise its number in focus.weights."
+            yield InputError(f"focus.distances[{index}]", rule, f"{format_length(distance)} twice", cure)
 
 
 def _beam(spec: "Spec") -> Iterator[InputError]:
