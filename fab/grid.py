@@ -30,7 +30,7 @@ def moved_edges(edges: NDArray[Any], move: Any) -> tuple[NDArray[Any], NDArray[n
     return moved, first, end
 
 
-_PITCHES_M = 1e-12, 1e3  # far beyond what is drawn, and squares of lengths stay numbers
+_PITCHES_M = 1e-20, 1e20  # far beyond what is drawn; squares of lengths and counts of pixels stay numbers
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Grid:
         pitch_m: edge of one pixel, metres.
 
     Raises:
-        InputError: a count below one, or a pitch that is not from 1 pm to 1 km.
+        InputError: a count below one, or a pitch that is not from 1e-20 m to 1e20 m.
     """
 
     shape: tuple[int, int]
@@ -56,7 +56,7 @@ class Grid:
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
         if not _PITCHES_M[0] <= self.pitch_m <= _PITCHES_M[1]:
-            raise InputError("grid: pitch", "must lie between 1 pm and 1 km", self.pitch_m, "Give the pixel pitch.")
+            raise InputError("grid: pitch", "must be positive, from 1e-20 m to 1e20 m", self.pitch_m, "Give the pixel pitch.")
 
     @property
     def extent_m(self) -> tuple[float, float]:
