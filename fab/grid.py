@@ -56,7 +56,9 @@ class Grid:
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
         if not _PITCHES_M[0] <= self.pitch_m <= _PITCHES_M[1]:
-            raise InputError("grid: pitch", "must be positive, from 1e-20 m to 1e20 m", self.pitch_m, "Give the pixel pitch.")
+            raise InputError(
+                "grid: pitch", "must be positive, from 1e-20 m to 1e20 m", self.pitch_m, "Give the pixel pitch."
+            )
 
     @property
     def extent_m(self) -> tuple[float, float]:
