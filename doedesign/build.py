@@ -75,7 +75,7 @@ def _require_light(camera: Camera) -> None:
         if not share >= _LEAST_POWER:
             rule = f"light of the beam must reach the aperture of {camera.opening}"
             got = f"{share:.2g} of its power there at {format_length(colour.wavelengths_m[0])}"
-            cure = 'Move it, for example centre = ["0 mm", "0 mm"], or choose a wider one.'
+            cure = 'Move it, for example centre = ["0 mm", "0 mm"], choose a wider one, or finer cells.'
             raise InputError("illumination.centre", rule, got, cure)
 
 

@@ -253,7 +253,10 @@ def power_through(beam: Beam, grid: Grid, aperture: Aperture, wavelength_m: floa
     if isinstance(beam, EvenBeam):
         return 1.0
     if isinstance(beam, GaussianBeam):
-        # The sum of all modes is as bright as one mode of its diameters.
-        y, x = beam.diameters_m(wavelength_m)
-        beam = GaussianBeam((y / 2, x / 2), centre_m=beam.centre_m)
+        # The sum of all modes is as bright as one mode of its diameters, which is a product of profiles along y and x.
+        y, x = (
+            _hermite_gaussian(0, grid.axis_m(axis) - centre, diameter / 2) ** 2
+            for axis, centre, diameter in zip(("y", "x"), beam.centre_m, beam.diameters_m(wavelength_m), strict=True)
+        )
+        return float(y @ (aperture.inside(grid) @ x)) * grid.pitch_m**2
     return float(beam_irradiance(beam, grid, aperture, wavelength_m)[aperture.inside(grid)].mean())

@@ -205,8 +205,10 @@ def _finished(folder: Path, digest: str) -> dict[int, str]:
     """Items that are there and whole, by number; damaged ones are removed, and what else lies there stays."""
     found = {}
     for path in sorted(folder.glob(f"*/{MANIFEST_NAME}")):
+        if not _ITEM.match(path.parent.name):
+            continue
         item = read_json(path)
-        if item.get("format") != FORMAT or not _ITEM.match(path.parent.name):
+        if item.get("format") != FORMAT or "number" not in item:  # a whole simulation has no number
             continue
         if item == _sealed(item) and item.get("settings_sha256") == digest and _files_are_whole(path.parent, item):
             found[item["number"]] = path.parent.name

@@ -272,12 +272,16 @@ def _require_units(errors: Mapping[str, Any]) -> None:
     """Raise an `InputError` for a bare number under the name of an error that has a unit."""
     for key, value in errors.items():
         unit = next((unit for unit in ("m", "rad") if f"{key}_{unit}" in DEVIATIONS), None)
-        numbers = [value.get(part) for part in ("mean", "sigma")] if isinstance(value, Mapping) else [value]
-        if unit is None or not any(isinstance(number, Real) for number in numbers):
+        parts = (
+            [*value.values()] if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else [value]
+        )
+        if unit is None or not any(isinstance(part, Real) for part in parts):
             continue
         name, example = f"{key}_{unit}", '"0.5 um"' if unit == "m" else '"2 deg"'
         rule = f"must be text with a unit such as {example}; a number goes by the name `{name}`"
-        raise InputError(f"errors: {key}", rule, value, f'Write {{"{name}": {value}}}, or give a unit.')
+        alike = all(isinstance(part, Real) for part in parts)
+        cure = f'Write {{"{name}": {value}}}, or give a unit.' if alike else "Give every number a unit."
+        raise InputError(f"errors: {key}", rule, value, cure)
 
 
 def _runner(design: "Design", workers: int | None, scheduler: str | None, in_memory: bool) -> Any:
@@ -318,7 +322,7 @@ def _for_workers(design: "Design") -> "Design":
         InputError: a picture that is missing or cannot be drawn.
     """
     bare = design.bare()
-    if bare.spec is None or not bare.spec.areas:
+    if bare.spec is None or not any(area.picture or area.phase_picture for area in bare.spec.areas):
         return bare
     from doedesign.areas.shape import targets_of_design
 

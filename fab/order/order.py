@@ -69,6 +69,9 @@ class Order:
         papers: whether a run sheet and pictures of the wafer, its marks and broken rules come with the masks.
         light: what the run sheet says of the light, if anything.
         formats: in which formats it is written.
+
+    Raises:
+        InputError: floors as deep as the wafer is thick.
     """
 
     rules: RulesReport
@@ -209,7 +212,12 @@ def plan_order(
     papers: bool = False,
     formats: Formats | None = None,
 ) -> Order:
-    """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`."""
+    """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`.
+
+    Raises:
+        InputError: what `Order` refuses, a process of another staircase, or masks that it cannot print where that is to
+            fail.
+    """
     made_by = process_from(process, level_map.levels)
     report = check(level_map, made_by)
     inside = level_map.level[level_map.relief.inside(level_map.grid)]

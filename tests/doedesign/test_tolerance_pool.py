@@ -157,6 +157,18 @@ def test_a_study_goes_on_where_it_was(ask: Callable[..., Study], fakes: ModuleTy
     assert len(lines(tmp_path / "plates")) == 5  # none was computed twice
 
 
+def test_a_study_begun_by_an_earlier_version_goes_on(ask: Callable[..., Study], right: dict, tmp_path: Path):
+    """Its lines have no digests."""
+    ask(out=tmp_path / "out").monte_carlo(2)
+    path = tmp_path / "out" / "draws.jsonl"
+    told = [{key: value for key, value in line.items() if key != "sha256"} for line in lines(path)]
+    path.write_text("".join(json.dumps(line) + "\n" for line in told))
+    again = ask(out=tmp_path / "out")
+    again.monte_carlo(3)
+    assert again.journal.finished == {key: right[key] for key in normal_keys(3)}
+    assert ["sha256" in line for line in lines(path)] == [False, False, True]
+
+
 def test_a_folder_keeps_one_study(ask: Callable[..., Study], fakes: ModuleType, tmp_path: Path):
     out = tmp_path / "out"
     ask(out=out).monte_carlo(1)

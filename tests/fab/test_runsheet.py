@@ -239,7 +239,12 @@ def test_what_the_process_is_known_to_do_to_depths_is_expected_and_not_undone():
     )
     text = page_of(content).text
     assert "Target depth 71.4 nm (expected: 74.999 nm)" in text
-    assert "next time = expected depth of the next etch / true rate" in text
+    assert "true rate = rate × measured depth / expected depth; next time = next target / true rate" in text
+    # So an etch that is 10 nm too deep, by the tool's rate of that day, is made up for by the next one.
+    rate, too_fast = 20.0, (first["expected_nm"] + 10) / first["expected_nm"]
+    asked = {row["off_by_nm"]: row["next_target_nm"] for row in first["corrections"]}[10]
+    next_depth = asked / (rate * too_fast) * rate * too_fast * 1.04
+    assert first["expected_nm"] + 10 + next_depth == pytest.approx(first["expected_nm"] + second["expected_nm"])
     assert "(expected:" not in page_of(record(sheet())).text
 
 
