@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Table = Float[np.ndarray, "w d"] | Float[Array, "w d"]
 Length = float | str
-_WIDEST_RAD = np.pi / 3  # of a field angle
+WIDEST_RAD = np.pi / 3  # of a field angle
 if TYPE_CHECKING:  # numpy and jax arrays serve alike
     Energies = Any
 else:
@@ -249,8 +249,8 @@ def field_from(field_rad: Any) -> tuple[float, float]:
         found = () if any(isinstance(angle, str) for angle in field_rad) else tuple(map(float, field_rad))
     except (TypeError, ValueError):  # no sequence, or no numbers; jax raises the former for what it traces
         found = ()
-    if len(found) != 2 or not all(abs(angle) <= _WIDEST_RAD for angle in found):
-        rule = f"must be two angles (y, x) within {_WIDEST_RAD:.4g} radians, 60 degrees"
+    if len(found) != 2 or not all(abs(angle) <= WIDEST_RAD for angle in found):
+        rule = f"must be two angles (y, x) within {WIDEST_RAD:.4g} radians, 60 degrees"
         raise InputError("field_rad", rule, str(field_rad), "A thin lens says nothing beyond. For example (0.0, 0.1).")
     return found
 

@@ -2,7 +2,8 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any, Literal
 
@@ -210,17 +211,10 @@ def masks(
         fixed = {"--levels": levels, "--step": step, "--etch-depths": etch_depths, "--pitch": pitch, "--scale": scale}
         fixed |= {"--aperture": aperture, "--wafer": wafer, "--terms": terms, "--probe": probe}
         _refuse_beside_as_built(fixed, "Leave it out: the order has its own.")
-        usual: dict[str, tuple[object, object]] = {
-            "--on-violation": (on_violation, "warn"),
-            "--plates": (plates, "gds.gz"),
-            "--mesh-cells": (mesh_cells, 200),
-            "--direct-write": (direct_write, False),
-            "--combined-gds": (combined_gds, False),
-            "--overwrite": (overwrite, False),
-        }
-        drawn = {option: None if given == default else given for option, (given, default) in usual.items()}
-        drawn |= {"--out": out, "--patch": patch, "--mesh-patch": mesh_patch}
-        _refuse_beside_as_built(drawn, "Leave it out: nothing is drawn.")
+        drawn: dict[str, object] = {"out": out, "patch": patch, "mesh_patch": mesh_patch, "on_violation": on_violation}
+        drawn |= {"plates": plates, "mesh_cells": mesh_cells, "direct_write": direct_write}
+        drawn |= {"combined_gds": combined_gds, "overwrite": overwrite}
+        _refuse_beside_as_built(_asked(masks, drawn), "Leave it out: nothing is drawn.")
         _predict_as_built(source, as_built, order, process, json_)
         return
     if order is not None:
@@ -257,6 +251,12 @@ def masks(
     say(f"{len(done.report.checks)} checks passed: every pixel of every file is {drawn_as(done)}")
     print_results(done.folder, json_, checks=len(done.report.checks))
     say_closing(done.folder, source if source.is_dir() else None, taken)
+
+
+def _asked(command: Callable[..., object], given: Mapping[str, object]) -> dict[str, object]:
+    """Options of a command, by their names, that are not as they are where none is given."""
+    usual = signature(command).parameters
+    return {f"--{name.replace('_', '-')}": value for name, value in given.items() if value != usual[name].default}
 
 
 def _refuse_beside_as_built(options: Mapping[str, object], cure: str) -> None:

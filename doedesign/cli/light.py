@@ -60,15 +60,17 @@ def psf(
         return
     if process is not None or variation is not None or seed is not None:
         raise InputError("--fabricated", "must be given with --process, --variation or --seed", "not there", "Add it.")
-    from math import inf, radians
+    from math import degrees, inf, radians
 
     from doedesign.runs.psfs import psfs
+    from sim.psf_bank import WIDEST_RAD
 
     depths_m = [inf if text == "inf" else length_of("--depths", text) or 0.0 for text in depths]
     if any(not z > 0 for z in depths_m):
         raise InputError("--depths", "must be positive", ", ".join(depths), 'For example --depths "5 cm".')
-    if not all(abs(angle) <= 60 for angle in field_deg):
-        raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
+    if not all(abs(radians(angle)) <= WIDEST_RAD for angle in field_deg):
+        rule = f"must lie within {degrees(WIDEST_RAD):.3g} degrees"
+        raise InputError("--field-deg", rule, field_deg, "A thin lens says nothing beyond.")
     folder = run / "psf"
     with measured(run, "psf") as taken:
         psfs(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), folder)

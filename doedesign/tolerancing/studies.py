@@ -272,9 +272,8 @@ def _require_units(errors: Mapping[str, Any]) -> None:
     """Raise an `InputError` for a bare number under the name of an error that has a unit."""
     for key, value in errors.items():
         unit = next((unit for unit in ("m", "rad") if f"{key}_{unit}" in DEVIATIONS), None)
-        parts = (
-            [*value.values()] if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else [value]
-        )
+        parts = tuple(value.values()) if isinstance(value, Mapping) else value
+        parts = parts if isinstance(parts, list | tuple) else (parts,)
         if unit is None or not any(isinstance(part, Real) for part in parts):
             continue
         name, example = f"{key}_{unit}", '"0.5 um"' if unit == "m" else '"2 deg"'

@@ -242,6 +242,17 @@ def test_what_an_order_has_is_no_part_of_what_was_built(cli, tmp_path, option: s
     assert f"{option}: does not go with --as-built" in done.err
 
 
+@pytest.mark.parametrize(
+    "options",
+    [["--on-violation", "fix"], ["--plates", "gds"], ["--mesh-cells", 9], ["--direct-write"], ["--overwrite"]],
+    ids=lambda options: options[0],
+)
+def test_options_of_what_is_drawn_do_nothing_for_what_was_built(cli, tmp_path, options: list):
+    done = cli("masks", tmp_path, "--as-built", tmp_path / "a.json", *options)
+    assert done.code == 2
+    assert f"{options[0]}: does not go with --as-built" in done.err
+
+
 def test_a_bare_map_has_no_light_for_a_laser(cli, tmp_path):
     options = write_map(tmp_path / "a.npy", np.full((30, 30), 3 * STEP_M), "npy")
     done = cli("masks", tmp_path / "a.npy", *options, "--probe", "633 nm")
