@@ -31,8 +31,8 @@ class Dirt(WithLimits):
 
     Attributes:
         depth_m: distance of the glass; the paper's 5 to 12 cm.
-        clump_m: width of the widest noise cells, about the distance of two clumps. The public release's cells come out
-            at 3.55 mm whatever the distance.
+        clump_m: width of the widest noise cells, about the distance of two clumps; the clumps themselves are about 0.6
+            of it wide. The public release's cells come out at 3.55 mm whatever the distance.
         octaves: scales of noise, each half the one before; the small ones make edges ragged.
         persistence: amplitude of a scale over that of the one before.
         blur_m: sigma of the Gaussian low-pass (an estimate: the paper gives none).

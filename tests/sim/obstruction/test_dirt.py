@@ -32,6 +32,20 @@ def test_clumps_have_a_size_of_their_own():
     assert clump_width_m(replace(dirt, clump_m=(1.5e-3, 1.5e-3)), 0.12) / far == pytest.approx(0.5, rel=0.2)
 
 
+def test_clumps_are_narrower_than_they_are_apart():
+    """A straight way through a clump, for the mean point on it, is 0.6 of the width of noise cells."""
+    view, dark = CameraView((320, 320), 29.6e-6, 16e-3), np.zeros((3, 320, 320), np.float32)
+    longest, clump_m = [], 5e-3
+    for seed in range(12):
+        drawn = Dirt(clump_m=(clump_m, clump_m)).draw(np.random.default_rng(seed), view, dark)
+        rows = np.pad(np.asarray(drawn.mask) >= 0.5, ((0, 0), (1, 1))).astype(int)
+        steps = np.diff(rows, axis=1)
+        ways = (np.nonzero(steps < 0)[1] - np.nonzero(steps > 0)[1]) * view.pixel_at_m(drawn.depth_m)
+        longest.append(np.sum(ways**2) / np.sum(ways))
+    # Seeds differ by 0.14, their mean by 0.04.
+    assert np.mean(longest) / clump_m == pytest.approx(0.6, abs=0.1)
+
+
 def test_the_threshold_leaves_the_share_asked_for(rng: np.random.Generator):
     field = layered_noise(rng, (200, 300), 40.0)
     for share in (0.05, 0.3, 0.8):
