@@ -106,11 +106,11 @@ class Plan:
     """
 
     size: int = 128
-    scenes: int = 160
+    scenes: int = 320
     judged: int = 32
-    steps: int = 600
+    steps: int = 3500
     batch: int = 2
-    width: int = 8
+    width: int = 16
     seed: int = 1
 
 
