@@ -134,6 +134,24 @@ def test_ring_to_disc_is_that_of_the_metrics() -> None:
     assert float(term.value(psfs)) == pytest.approx(np.mean(lacks), rel=1e-3)
 
 
+@pytest.mark.parametrize("window", [64, 65])
+def test_the_disc_of_ring_to_disc_lies_on_the_axis(window: int) -> None:
+    """Of an even window between the four middle pixels: light on one side counts as that on the other."""
+    camera = replace(CAMERA, window=window)
+    disc = circle_coverage(Grid((window, window), camera.pixel_m), 2 * 10 * camera.pixel_m)
+    weights = np.random.default_rng(0).uniform(0.5, 1, disc.shape)
+    light = weights * disc + 0.1 * (1 - disc)
+    found = []
+    for way in (light, light[::-1], light[:, ::-1]):
+        near = jnp.asarray(way / way.sum(), jnp.float32)[None, None]
+        found.append(float(ring_to_disc(PsfSet(near, near[:, :0], jnp.ones((1, 1)), DISC, camera), least=30.0)))
+    # Sums of single precision.
+    assert found[1:] == pytest.approx([found[0]] * 2, rel=1e-5)
+    ring = light.sum() - (light * disc).sum()
+    # Squares at the edge are cut by a line here and into strips there.
+    assert found[0] == pytest.approx((30.0 - ring / (light * disc).sum()) ** 2, rel=1e-3)
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.5, True])
 def test_shares_are_shares(share: Any) -> None:
     for call in (lambda: spot_energy(of_spots(0.3), energy=share), lambda: window_share(of_spots(0.3), least=share)):
