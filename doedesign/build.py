@@ -63,6 +63,7 @@ def camera_from_spec(spec: Spec) -> Camera:
         distance_m=np.inf if spec.sensor.in_angles else spec.sensor.distance_m,
     )
     _require_light(camera)
+    camera.require_upright((0.0, 0.0))
     return camera
 
 

@@ -28,6 +28,9 @@ _INVERSIONS = 8  # steps of Newton's method that undo a distortion; five reach d
 # How far beyond the corners of a window the image must not be folded over: light is looked for a little outside.
 _MARGIN = 1.2
 _PARAXIAL = 0.02  # wave
+# Without a lens an image is that of the axis, moved, while an oblique chief ray adds less than so much of a wave of
+# astigmatism and coma at the rim (a Strehl ratio above 0.98) and of the distances of places.
+_ASLANT, _STRETCHED = 0.05, 0.01
 Light = Literal["scalar", "edges"]
 Polarised = Literal["unpolarised", "x", "y"]
 
@@ -261,6 +264,36 @@ class Camera:
         reach = self.opening.reach_m + self.window * self.pixel_m / math.sqrt(2)
         follows = max(self.grid.shape) * self.grid.pitch_m**2 / shortest
         return max(follows, (reach**4 / (8 * shortest * _PARAXIAL)) ** (1 / 3))
+
+    def require_upright(self, field_rad: tuple[float, float]) -> None:
+        """Raise an `InputError` for a chief ray so aslant that a sensor without a lens sees another image than on axis.
+
+        A lens images all directions alike; without one the wave to a place aside has astigmatism and coma, r² / 2d and
+        r³ / 2d² times functions of the angle, which are left out here.
+        """
+        chief_rad = self.chief_rad(field_rad)
+        if self.distance_m is None or self.in_angles or not any(chief_rad):
+            return
+        sine, most = float(np.hypot(*direction_sines(chief_rad))), self._steepest_sine
+        if sine > most:
+            where = "field_rad" if any(field_rad) else "illumination.angle"
+            rule = (
+                f"without a lens, light must arrive within {math.degrees(math.asin(most)):.2g} degrees of the axis here"
+            )
+            cure = "Leave it out, or look through a lens; of beams give the tilt, which the sensor does not follow."
+            raise InputError(where, rule, f"{math.degrees(math.asin(sine)):.3g} degrees", cure)
+
+    @property
+    def _steepest_sine(self) -> float:
+        """Largest sine of a chief ray for `require_upright`, of a sensor without a lens."""
+        assert self.distance_m is not None
+        rim, shortest = self.opening.reach_m, min(w for colour in self.colours for w in colour.wavelengths_m)
+        sines = np.linspace(0.0, 0.1, 1001)  # places are stretched by more from 0.082 on
+        stretched = (1 - sines**2) ** -1.5 - 1
+        astigmatism = rim**2 / (2 * self.distance_m) * (1 - (1 - sines**2) ** 1.5)
+        coma = rim**3 / (2 * self.distance_m**2) * sines
+        seen = (astigmatism + coma <= _ASLANT * shortest) & (stretched <= _STRETCHED)
+        return float(sines[seen][-1])
 
     def axis_m(self) -> Float[np.ndarray, " window"]:
         """Pixel centres on the sensor relative to the chief ray, metres."""

@@ -70,7 +70,7 @@ class Optic(eqx.Module):
             field_rad: field angles (y, x); they matter to lenses that do not image sines (`Camera.mapping`).
 
         Raises:
-            InputError: a direct path where eq. 6 does not hold.
+            InputError: a direct path where eq. 6 does not hold, or light too far aslant where there is no lens.
         """
 
     @abstractmethod
@@ -140,6 +140,7 @@ class CellOptic(CameraOptic):
         field_rad: tuple[float, float] = ON_AXIS,
     ) -> FarField | DirectPath:
         """Operators of the far field, or of a direct kernel (which serves every depth)."""
+        self.camera.require_upright(field_rad)
         propagation = propagation or self.camera.propagation
         if propagation == "far_field":
             return plan_far_field(

@@ -72,8 +72,8 @@ class DrawnPattern(NamedTuple):
     Attributes:
         target: light wanted per pixel, summing to 1.
         light: shares of the incident light per pixel.
-        efficiency: energy on the target per incident energy (inside the spots of a spot pattern; where the target is
-            above half its peak otherwise).
+        efficiency: energy on the target per incident energy, Fresnel loss left out (inside the spots of a spot pattern;
+            where the target is above half its peak otherwise).
         uniformity: 1 - (max - min) / (max + min) over spots, or 1 - standard deviation / mean over the pixels of an
             area that are a full Airy radius inside it.
         colour: name of the colour channel, where the objective names colours or depths.
@@ -117,12 +117,15 @@ def _pattern_numbers(
     camera: Camera, light: Float[np.ndarray, "y x"], target: Float[np.ndarray, "y x"], options: Mapping[str, Any]
 ) -> tuple[float, float]:
     """Efficiency and uniformity of a pattern in the one colour of a camera."""
+    colour = camera.colours[0]
+    # As of spots, areas and foci: what the glass faces reflect is told apart.
+    passed = float(np.dot(colour.weights, [camera.transmission(one) for one in colour.wavelengths_m]))
     if options.get("pattern") == "spots":
         shares = _spot_energies(camera, light, options)
-        return float(shares.sum()), float(1 - (shares.max() - shares.min()) / (shares.max() + shares.min()))
+        return float(shares.sum()) / passed, float(1 - (shares.max() - shares.min()) / (shares.max() + shares.min()))
     area = target > target.max() / 2
-    efficiency = light[area].sum(dtype=np.float64)
-    radius = airy_radius_m(camera, mean_wavelength_m(camera.colours[0])) / camera.pixel_m
+    efficiency = light[area].sum(dtype=np.float64) / passed
+    radius = airy_radius_m(camera, mean_wavelength_m(colour)) / camera.pixel_m
     reach = int(np.ceil(radius))
     disc = radius_map_m((2 * reach + 1, 2 * reach + 1), 1.0) <= radius
     inside: Any = binary_erosion(area, disc)

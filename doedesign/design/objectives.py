@@ -176,8 +176,9 @@ def ring_to_disc(psfs: PsfSet, *, least: float) -> Array:
     """
     if not isinstance(least, int | float) or isinstance(least, bool) or not least > 0:
         raise InputError("ring_to_disc: least", "must be a ratio above 0", repr(least), "For example 1.5.")
-    middle = jnp.arange(psfs.near.shape[-1]) - psfs.near.shape[-1] // 2
-    inside = jax.vmap(partial(open_shares, middle, middle))(psfs.disc_radius_m / psfs.camera.pixel_m)
+    count = psfs.near.shape[-1]
+    places = jnp.arange(count) - (count - 1) / 2  # of an even count the axis lies between pixels
+    inside = jax.vmap(partial(open_shares, places, places))(psfs.disc_radius_m / psfs.camera.pixel_m)
     disc = jnp.einsum("wnyx,nyx->wn", psfs.near, inside)
     ring = jnp.sum(psfs.near, axis=(-2, -1)) - disc
     return psfs.highest(jnp.maximum(least - ring / disc, 0.0) ** 2)

@@ -32,7 +32,7 @@ def plot_orders(table: "OrderTable", ax: "Axes | None" = None) -> "FigureBase":
         ceiling = f"Ceiling {100 * bound.efficiency:.1f} %: {bound.source}."
     zeroth = f"0th order ({ONE_OF_THE_SPOTS})" if table.zeroth_order_wanted else "0th order"
     lost = f"{100 * (1 - table.fresnel):.1f} % that faces reflect"
-    note = f"Shares of the light on the aperture; {lost} are left out. {ceiling}"
+    note = f"Shares of the incident light; {lost} are left out. {ceiling}"
     with panels(ax, (8.6, 4.4), title, note) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.7, 1.0))
         at = np.arange(spots.count)

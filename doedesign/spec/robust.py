@@ -87,5 +87,8 @@ def _source_problems(spec: "Spec", robust: RobustSpec) -> Iterator[InputError]:
     if optics.mapping != "sine" or any(optics.distortion):
         cure = 'Set field = "off", or leave mapping and distortion out.'
         yield InputError("robust.field", "the lens images sines, without distortion", '"random"', cure)
+    if spec.sensor.distance_m is not None:
+        rule, cure = "without a lens, light from beside the axis makes other images", 'Set field = "off".'
+        yield InputError("robust.field", rule, '"random"', cure)
     if spec.illumination is not None:
         yield InputError("robust.field", "a beam has its own direction", '"random"', 'Set field = "off".')

@@ -17,6 +17,8 @@ from fab.aperture import RoundAperture
 from fab.grid import Grid
 from fab.units import MILLIMETRES, PlaceUnit
 from sim.camera import Camera
+from sim.illumination import EvenBeam
+from sim.metrics import opening
 from sim.optic import CellOptic
 from sim.propagation.directions import DirectionSum, peak_amplitudes
 
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 # Spot widths from a spot within which light that goes straight on is its light.
 _AT_THE_ZEROTH = 0.5
+_ALL = 0.9995  # of a beam
 _AROUND = 3  # orders beyond the spots among which stray light is looked for
 
 # Efficiency of equal spots by a DOE of any phase: the best that is known, columns by rows.
@@ -56,6 +59,12 @@ class Ceiling:
     efficiency: float | None
     source: str
 
+    def behind(self, passed: float) -> "Ceiling":
+        """The same of light of which a share has passed the chrome."""
+        if self.efficiency is None or passed > _ALL:
+            return self
+        return Ceiling(passed * self.efficiency, f"{self.source}; times the {100 * passed:.3g} % that pass the chrome")
+
 
 def ceiling_of(count: tuple[int, int] | None, levels: int, *, equal: bool = True) -> Ceiling:
     """The best known efficiency of a grid of equal spots in any phase, times sinc²(1 / levels) for their levels.
@@ -76,7 +85,7 @@ class OrderTable:
 
     Attributes:
         spots: where they are.
-        efficiency: `[spot]` share of the light on the aperture, Fresnel loss left out.
+        efficiency: `[spot]` share of the light on the aperture, or of the power of a beam, Fresnel loss left out.
         zeroth_order: the same of light that goes straight on.
         strongest_stray: the same of the strongest order around the spots that should have none; None where spots lie on
             no lattice.
@@ -217,6 +226,9 @@ def order_table(
     bare = camera.beam is not None or away
     plain = replace(optic, camera=replace(camera, beam=None, **focal)) if bare else optic
     field, coverage, grid = np.asarray(plain.field(line, np.inf)), np.asarray(optic.coverage), camera.grid
+    # Of a beam that is wider than the opening the chrome takes its part, as it does from PSFs and areas.
+    even = camera.beam is None or isinstance(camera.beam, EvenBeam)
+    passed = 1.0 if even else float(opening(optic, line.wavelength_m))
     if camera.beam is not None and period_m is None:  # a spot is what has the shape of the beam's own far field
         light = camera.irradiance(line.wavelength_m)
         field, coverage = field * light, coverage * light
@@ -224,9 +236,9 @@ def order_table(
     if period_m is not None:
         field, coverage, grid, middle_m = _whole_periods(field, coverage, camera, period_m)
     asked = [spots.waves_per_m, np.zeros((1, 2)), *([stray] if len(stray := _stray(spots)) else [])]
-    light = peak_amplitudes(field, coverage, grid, np.concatenate(asked))
+    light = peak_amplitudes(field, coverage, grid, np.concatenate(asked)) * np.sqrt(passed)
     found, own_light, given = np.abs(light) ** 2, light[: spots.count], spots.about(middle_m)
-    errors, wave = (None, None) if given.phases is None else _in_wave(given, own_light, coverage, grid)
+    errors, wave = (None, None) if given.phases is None else _in_wave(given, own_light, coverage, grid, passed)
     own, zeroth, rest = np.split(found, [spots.count, spots.count + 1])
     equal = bool(np.ptp(spots.shares) < 1e-9)
     return OrderTable(
@@ -236,7 +248,7 @@ def order_table(
         float(rest.max()) if len(rest) else None,
         camera.transmission(line.wavelength_m),
         _places_m(spots, camera, line.wavelength_m),
-        ceiling_of(count, levels, equal=equal) if levels else Ceiling(None, "none known"),
+        ceiling_of(count, levels, equal=equal).behind(passed) if levels else Ceiling(None, "none known"),
         camera.light,
         camera.told_in(MILLIMETRES),
         errors,
@@ -246,13 +258,13 @@ def order_table(
 
 
 def _in_wave(
-    spots: Spots, light: Complex[np.ndarray, " m"], coverage: Float[np.ndarray, "y x"], grid: Grid
+    spots: Spots, light: Complex[np.ndarray, " m"], coverage: Float[np.ndarray, "y x"], grid: Grid, passed: float
 ) -> tuple[Float[np.ndarray, " m"], WaveShare]:
-    """Phase errors of spots of given phases, and how much light is in their wave."""
+    """Phase errors of spots of given phases, and how much light is in their wave, of which a share has `passed`."""
     wave = DirectionSum(grid, spots.waves_per_m).superposition(spots.wave)
     in_step = np.sum(np.abs(wave) * coverage, dtype=np.float64) / np.sum(coverage, dtype=np.float64)
     errors = spots.phase_errors(light)
-    return errors, WaveShare(spots.in_wave(light), float(in_step**2), float(np.sqrt(np.mean(errors**2))))
+    return errors, WaveShare(spots.in_wave(light), float(passed * in_step**2), float(np.sqrt(np.mean(errors**2))))
 
 
 def _whole_periods(

@@ -19,6 +19,7 @@ from fab.grid import Grid
 from fab.pictures import write_pixels
 from fab.units import parse_angle
 from sim.illumination import EvenBeam, GaussianBeam, MeasuredBeam, power_through
+from sim.metrics import energy_budget
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.transfer import mtf
@@ -221,6 +222,29 @@ def test_spots_of_a_gaussian_beam_are_equal(tmp_path: Path):
     assert even is not None
     assert lit.measures()["uniformity_error"] < 0.05
     assert lit.measures()["on_target"] > 0.75
+
+
+@pytest.mark.parametrize("radius_m", [60e-6, 91e-6])
+@pytest.mark.parametrize(
+    "where", ["spots={ arrangement = 'list', places = [['0 um', '0 um'], ['400 um', '0 um']] }", ""]
+)
+def test_spots_are_shares_of_the_power_of_a_beam(tmp_path: Path, radius_m: float, where: str):
+    """A flat plate leaves all that passes in the middle: 1 - exp(-2 R² / w²) of a Gaussian, as its budget says."""
+    diameter = f'illumination.diameter="{2e6 * radius_m:g} um"'
+    spec = spec_of(tmp_path, GAUSSIAN, diameter, *([where] if where else []))
+    assert spec.spots is not None
+    camera, table = camera_from_spec(spec), spec.spots
+    flat = HeightOptic.of(camera)
+    found = order_table(flat, spots_from_spec(table, camera), period_m=table.period_m, count=table.count, levels=8)
+    passed = 1 - np.exp(-2 * (camera.aperture_m / 2 / radius_m) ** 2)
+    assert found.zeroth_order == pytest.approx(passed, rel=1e-3)  # of cells of 2 um on the rim
+    dark = np.zeros((camera.window, camera.window))
+    budget = energy_budget(flat, dark, np.inf, camera.colours[0])
+    assert found.zeroth_order == pytest.approx(1 - budget.blocked, rel=1e-6)  # the same sums, in another order
+    if found.ceiling.efficiency is not None:
+        plain = order_table(HeightOptic.of(replace(camera, beam=None)), found.spots, count=table.count, levels=8)
+        assert plain.ceiling.efficiency is not None
+        assert found.ceiling.efficiency == pytest.approx(passed * plain.ceiling.efficiency, rel=1e-3)
 
 
 @pytest.mark.slow

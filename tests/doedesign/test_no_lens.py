@@ -68,6 +68,18 @@ def test_the_way_of_light_follows_from_the_distance(tmp_path: Path):
     assert spec_of(tmp_path).image_distance_m == 5e-3
 
 
+def test_light_from_beside_the_axis_has_images_of_its_own(tmp_path: Path):
+    """Astigmatism and coma of 20 degrees, 0.8 waves at this rim, are not computed; of a tilt the sensor stays."""
+    with pytest.raises(InputError, match=r"robust\.field: without a lens, light from beside the axis"):
+        spec_of(tmp_path, 'robust={ draws = 4, field = "random" }')
+    beam = "illumination={ kind = 'plane', WAY = ['0 deg', '20 deg'] }"
+    with pytest.raises(
+        InputError, match=r"illumination\.angle: without a lens, light must arrive within 4\.\d degrees"
+    ):
+        camera_from_spec(spec_of(tmp_path, beam.replace("WAY", "angle")))
+    assert camera_from_spec(spec_of(tmp_path, beam.replace("WAY", "tilt"))).is_tilted
+
+
 def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
     spec = spec_of(tmp_path)
     path = tmp_path / "again.toml"

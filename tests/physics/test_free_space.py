@@ -117,6 +117,42 @@ def test_what_cannot_be_is_refused(changes: dict[str, object], words: str):
         replace(CAMERA, **changes)  # pyright: ignore[reportArgumentType]
 
 
+def along_a_chief_ray(camera: Camera, height_m: np.ndarray, angle_rad: float, at_m: np.ndarray) -> np.ndarray:
+    """Intensity at places along x about the chief ray of plane light at an angle, on a sensor square to the axis."""
+    assert camera.distance_m is not None
+    offsets = ((np.arange(PARTS) + 0.5) / PARTS - 0.5) * camera.grid.pitch_m
+    axis = (camera.grid.axis_m("y")[:, None] + offsets).ravel()
+    fine = np.ones((PARTS, PARTS))
+    rate = camera.waves_per_metre(WAVE, (0.0, angle_rad))
+    field = np.kron(circle_coverage(camera.grid, camera.aperture_m) * np.exp(2j * np.pi * rate * height_m), fine)
+    field = field * np.exp(2j * np.pi / WAVE * axis * np.sin(angle_rad))
+    found = []
+    for place in camera.distance_m * np.tan(angle_rad) + at_m:
+        far = np.sqrt(axis[:, None] ** 2 + (axis - place) ** 2 + camera.distance_m**2)
+        found.append(np.abs(np.sum(field * np.exp(2j * np.pi / WAVE * far) / far**2)) ** 2)
+    return np.array(found)
+
+
+def test_light_too_far_aslant_for_a_sensor_without_a_lens_is_refused():
+    """At the largest angle that is taken a focus is as on the axis; at six times it, a fifth as bright."""
+    # A smaller DOE than elsewhere in this file, for the sums.
+    camera = replace(CAMERA, grid=Grid((32, 32), PITCH), aperture=128e-6, distance_m=1e-3)
+    height = lens_height_m(1e-3, camera)
+    optic = HeightOptic.of(camera, height)
+    with pytest.raises(InputError, match=r"field_rad: without a lens, light must arrive within [\d.]+ deg.*got 30 deg"):
+        psf(optic, field_rad=(0.0, np.pi / 6))
+    steepest = np.arcsin(camera._steepest_sine)
+    assert 0.03 < steepest < 0.1
+    places = np.arange(-4, 5) * 1e-6
+    upright, limit, beyond = (
+        along_a_chief_ray(camera, height, angle, places) for angle in (0.0, 0.98 * steepest, 6 * steepest)
+    )
+    # A Strehl ratio of 0.98, obliquity, and places that are farther apart by 1 %.
+    assert limit == pytest.approx(upright, abs=0.04 * upright.max())
+    assert beyond.max() < 0.2 * upright.max()
+    psf(optic, field_rad=(0.0, 0.98 * steepest))
+
+
 def test_a_window_beyond_the_grid_is_refused_with_its_limit():
     camera = replace(CAMERA, window=600)
     with pytest.raises(InputError, match="three apertures"):
