@@ -123,9 +123,10 @@ class _Task:
 
     @cached_property
     def mean(self) -> tuple[np.ndarray, np.ndarray]:
-        """Share by which every mask's etch goes too deep, and growth of its openings at every edge, metres."""
+        """Share by which every etch goes too deep at the DOE, and growth of every mask's openings per edge, metres."""
         expected, zeros = self.process.expected(), (0.0,) * self.process.masks
-        deep = (1 + expected.common_depth_scale) * (1 + np.array(expected.depth_scale or zeros)) - 1
+        scale = (1 + expected.common_depth_scale) * (1 + np.array(expected.depth_scale or zeros))
+        deep = scale * self.process.depth_at_die - 1
         return deep, expected.common_cd_bias_m + np.array(expected.cd_bias_m or zeros)
 
     @cached_property
@@ -148,7 +149,8 @@ class _Task:
         """The expected plate, with commands as errors of the design's own etches and masks."""
         expected, (deep, wide) = self.process.expected(), self.mean
         ratio = np.array(commands.depths_m) / np.array(self.process.depths_m())
-        scale = ratio * (1 + deep) / (1 + expected.common_depth_scale) - 1
+        # Uniformity is an error of its own.
+        scale = ratio * (1 + deep) / (1 + expected.common_depth_scale) / self.process.depth_at_die - 1
         bias = wide + np.array(commands.moves_m) - expected.common_cd_bias_m
         errors = replace(expected, depth_scale=tuple(scale.tolist()), cd_bias_m=tuple(bias.tolist()))
         level, camera = self.design.level_map.level, self.design.camera

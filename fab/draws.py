@@ -174,7 +174,9 @@ def chosen_errors(process: Process, what: str) -> tuple[str, ...]:
     keys = {name: name.partition("[")[0] for name in names}
     found = tuple(n for n, key in keys.items() if what in (n, short_name(n), key, short_name(key), source_of(n)))
     if not found:
-        choices = ", ".join(dict.fromkeys((*sources_of(process), *map(short_name, keys.values()))))
+        # Plates also differ by which roughness they have, which no budget scales.
+        sources = [source for source in sources_of(process) if source == DEFECTS or source in map(source_of, names)]
+        choices = ", ".join(dict.fromkeys((*sources, *map(short_name, keys.values()))))
         raise InputError("budget", "must name errors that vary in this process", f'"{what}"', f"One of {choices}.")
     return found
 

@@ -156,6 +156,14 @@ class Process:
         """Nominal depth of every mask's etch, first mask first."""
         return self.levels.depths_m
 
+    @property
+    def depth_at_die(self) -> float:
+        """Depth of an etch at the middle of the DOE over that at the middle of the wafer, by mean non-uniformity."""
+        y, x = (at / self.wafer_radius_m for at in self.die_m) if any(self.die_m) else (0.0, 0.0)
+        names = ("radial_nonuniformity", "linear_nonuniformity_y", "linear_nonuniformity_x")
+        bowl, tilt_y, tilt_x = (self.spreads.get(name, Normal()).mean for name in names)
+        return 1 + bowl * (y * y + x * x) + (tilt_y * y + tilt_x * x)
+
     def expected(self) -> Variation:
         """The plate with every error at its mean."""
         return variation_of(self.masks, {name: spread.mean for name, spread in self.spreads.items()})

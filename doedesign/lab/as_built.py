@@ -89,10 +89,7 @@ def _mask_errors(
     times = 1 if mask.times_etched is None else mask.times_etched
     if depth_m is not None and times:
         # The die is etched as deep as the process's mean non-uniformity has it there.
-        y, x = (at / process.wafer_radius_m for at in process.die_m)
-        tilt = mean["linear_nonuniformity_y"] * y + mean["linear_nonuniformity_x"] * x
-        share = 1 + mean["radial_nonuniformity"] * (y * y + x * x) + tilt
-        found[f"depth_scale[{bit}]"] = depth_m / (times * process.depths_m()[bit] * share) - 1
+        found[f"depth_scale[{bit}]"] = depth_m / (times * process.depths_m()[bit] * process.depth_at_die) - 1
     if mask.edges_m is not None:
         found[f"cd_bias_m[{bit}]"] = mask.edges_m
     # The verniers stand at the die; an overlay is that of the middle of the wafer.
@@ -189,7 +186,9 @@ def compare_gratings(measured: AsBuilt, process: Process, variation: Variation, 
     nominal = process.depths_m()
     scales = variation.depth_scale or (0.0,) * process.masks
     repeats = variation.repeats or (0,) * process.masks
-    built = [d * (1 + s) * (1 + again) for d, s, again in zip(nominal, scales, repeats, strict=True)]
+    # Gratings lie beside the pads, whose depth has the mean non-uniformity in it (`_mask_errors`).
+    here = process.depth_at_die
+    built = [d * here * (1 + s) * (1 + again) for d, s, again in zip(nominal, scales, repeats, strict=True)]
     # The binary grating is that of the deepest target, whatever became of it.
     deepest = max(range(process.masks), key=lambda bit: nominal[bit])
     drawn = grating_orders(nominal, material, probe_nm * NM)

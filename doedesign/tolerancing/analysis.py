@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from doedesign.spec import LimitSpec
+from doedesign.spec import LimitSpec, validated
 from doedesign.tolerancing.pool import OutOfModel, Rows
 from fab.errors import InputError
 from fab.units import format_length, parse_length
@@ -111,7 +111,11 @@ class Sample:
         return Sample(tuple(keys), self.places, values, self.limits)
 
     def obeys(self, limit: LimitSpec) -> Bool[np.ndarray, " draw"]:
-        """Whether every row of a draw that a limit concerns obeys it; an InputError if it concerns none."""
+        """Whether every row of a draw that a limit concerns obeys it; one beyond the model obeys none.
+
+        Raises:
+            InputError: a limit that concerns no row.
+        """
         rows = self.rows_of(limit.quantity, limit.colour, limit.depth_m) if limit.quantity in self.values else []
         if not rows:
             rule = "must match a colour and depth"
@@ -119,7 +123,7 @@ class Sample:
             raise InputError(f"limit on {limit.quantity}", rule, limit_text(limit), f"One of {places}.")
         values = self.values[limit.quantity][:, rows]
         low, high = -math.inf if limit.min is None else limit.min, math.inf if limit.max is None else limit.max
-        return np.all((values >= low) & (values <= high), axis=1)
+        return self.within & np.all((values >= low) & (values <= high), axis=1)
 
     @property
     def good(self) -> Bool[np.ndarray, " draw"]:
@@ -222,10 +226,12 @@ def limit_from_text(text: str) -> LimitSpec:
             raise ValueError(text)  # noqa: TRY301 - explained below, as any other mistake
         bound = float(f"{float(found[3]) / (100 if found[4] else 1):.15g}")
         depth = None if found[6] is None else math.inf if found[6] == "inf" else parse_length(found[6])
-        side = {"max" if found[2] == "<=" else "min": bound}
-        return LimitSpec.model_validate({"quantity": found[1], **side, "colour": found[5], "depth_m": depth})
     except ValueError as error:
         raise InputError("limit", "must be a quantity, <= or >=, and a number", f'"{text}"', cure) from error
+    side = {"max" if found[2] == "<=" else "min": bound}
+    # What is a limit in form may still ask for the impossible, such as a share of 150 %: its own rule says so.
+    given = {"quantity": found[1], **side, "colour": found[5], "depth_m": depth}
+    return validated(LimitSpec, given, f'limit "{text}"', si=True)
 
 
 def limit_text(limit: LimitSpec) -> str:

@@ -10,6 +10,8 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from doedesign import __version__
 from doedesign.build import resolve_process, with_edge_moves
 from doedesign.runs.folder import Run
@@ -311,7 +313,18 @@ def _given(camera: Camera) -> dict[str, Any]:
     usual = {field.name: field.default for field in fields(Camera) if field.name not in ("fill", "defocus_m")}
     given = {name: value for name, value in asdict(camera).items() if name not in usual or value != usual[name]}
     del given["aperture"]
-    return {**given, "aperture_m": camera.opening.record()}
+    return {**_recorded(given), "aperture_m": camera.opening.record()}
+
+
+def _recorded(value: Any) -> Any:
+    """A value for JSON, which has neither infinity (no lens, a far source) nor pictures (a measured beam)."""
+    if isinstance(value, Mapping):
+        return {name: _recorded(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_recorded(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return {"shape": list(value.shape), "sha256": sha256_bytes(np.ascontiguousarray(value, np.float64).tobytes())}
+    return "inf" if isinstance(value, float) and math.isinf(value) else value
 
 
 def _for_workers(design: "Design") -> "Design":

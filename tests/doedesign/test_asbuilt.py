@@ -246,6 +246,16 @@ def test_verniers_and_pads_tell_of_the_place_of_the_die():
     assert found.value("depth_scale[0]") == pytest.approx(0, abs=1e-12)
 
 
+def test_gratings_are_as_deep_as_the_pads_beside_them():
+    """Pads of the drawn depths are gratings as drawn, also where the process is known to etch deeper at the die."""
+    process = Process(LEVELS, spreads=spreads_of(LEVELS, radial_nonuniformity=(0.04, 0.0)), die_m=(40e-3, 0.0))
+    as_drawn = (MaskMeasured(depths_m=((math.inf, depth_m),)) for depth_m in LEVELS.depths_m)
+    shown = measured(*as_drawn, predicted={"probe_wavelength_nm": 633})
+    variation = as_built_doe(shown, process).variation
+    for row in compare_gratings(shown, process, variation, "fused_silica"):
+        assert row["as_built"] == pytest.approx(row["as_drawn"], rel=1e-9)
+
+
 @pytest.mark.slow
 def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run, design, tmp_path, caplog):
     wanted = predict(design, IDEAL, PLATE)

@@ -130,6 +130,24 @@ def test_masks_predictions_and_studies_take_the_new_run(made: tuple[Path, str], 
     assert "yield 100.0 %" in words
 
 
+def test_depths_are_undone_where_the_doe_lies_on_the_wafer(run: Path):
+    """A mean bowl of 4 % etches 2.56 % too deep at 40 of 50 mm: so much less is commanded, and the design expected."""
+    design = open_design(run, False)
+    spreads = {"radial_nonuniformity": Normal(0.04), "common_depth_scale": Normal(0.01)}
+    process = Process(design.levels, spreads=spreads, die_m=(40e-3, 0.0), wafer_radius_m=50e-3)
+    task = precompensation._Task(design, process, lambda _: 0.0)
+    commands = task.search(0)
+    for row, depth_m in zip(task.mask_rows(commands), design.levels.depths_m, strict=True):
+        designed = depth_m / 1e-9
+        # Within the tenth of a nanometre of a recipe.
+        assert row.commanded_nm == pytest.approx(designed / (1.01 * 1.0256), abs=0.051)
+        assert row.expected_nm == pytest.approx(designed, abs=0.06)
+    # And so the light of the plate is the design's.
+    wanted = psf(design, depths=design.depths_m).energy
+    found = psf(task.plate(commands), depths=design.depths_m).energy
+    assert np.abs(found - wanted).max() < 2e-3 * wanted.max()
+
+
 def test_it_is_made_once(run: Path, made: tuple[Path, str], estimate: Path, monkeypatch: pytest.MonkeyPatch):
     def refused(*_: object) -> None:
         raise AssertionError("searched again")

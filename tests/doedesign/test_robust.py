@@ -1,6 +1,7 @@
 """Robust designs: steps that look at plates as fabricated."""
 
 from pathlib import Path
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from doedesign import optimization
+from doedesign.build import process_from_spec
 from doedesign.design import robust as robust_steps
 from doedesign.design.design import Design
 from doedesign.design.problem import Problem, SourceSet, problem_of, value_and_slope
@@ -16,6 +18,7 @@ from doedesign.design.robust import RobustTask, risk_of, wall_costs
 from doedesign.optimization import optimize
 from doedesign.spec import RobustSpec, load_spec
 from doedesign.spec.process import ErrorsSpec
+from fab.draws import normal_draw, varying
 from fab.errors import InputError
 from fab.levels import Levels
 from fab.process import Normal, Process
@@ -106,6 +109,19 @@ def test_the_worst_plate_is_that_of_the_highest_mean(spec: Path) -> None:
     begun = task.initial_state(np.zeros((48, 48), np.uint8))
     losses = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.1]) * [7, 7, 7, 7, 6, 6]
     assert task.worst_of(begun._replace(losses=losses), 0).tolist() == [0, 5]
+
+
+def test_no_study_judges_by_plates_that_the_steps_saw(spec: Path) -> None:
+    """Errors of a round are none of the draws of a tolerance study of the same seed."""
+    read = load_spec(spec)
+    process, nothing = process_from_spec(read.process), cast("Any", None)  # errors are drawn without light
+    task = RobustTask(read, nothing, nothing, process, nothing)
+    judged = [normal_draw(process, read.optimize.seed, index, 1e-3) for index in range(20)]
+    known = {name: {draw.value(name) for draw in judged} for name in varying(process)}
+    assert known
+    for round_ in range(3):
+        for plate in task.variations(round_, np.full(2, -1)):
+            assert not any(plate.value(name) in values for name, values in known.items())
 
 
 def test_roughness_is_drawn_anew_in_every_round(spec: Path) -> None:

@@ -22,6 +22,7 @@ from doedesign.tolerancing.sensitivity import source_shares
 from doedesign.tolerancing.studies import Study, study
 from fab.errors import InputError
 from fab.process import Normal, Process, Variation
+from sim.illumination import EvenBeam, MeasuredBeam
 from tests.pictures import leave_out_pictures
 
 
@@ -160,10 +161,23 @@ def test_a_limit_on_what_is_not_there_is_refused(text: str):
 
 @pytest.mark.parametrize(
     "text",
-    ["zeroth order <= 5 %", "brightness >= 1", "strehl > 0.5", "strehl >= 5", "strehl >= 1e", "strehl >= 1 at 5"],
+    ["zeroth order <= 5 %", "brightness >= 1", "strehl > 0.5", "strehl >= 1e", "strehl >= 1 at 5"],
 )
 def test_words_that_are_no_limit_are_refused(text: str):
     with pytest.raises(InputError, match=r"limit: must be a quantity.*zeroth_order <= 5 %"):
+        limit_from_text(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("strehl >= 5", r"min: must lie between 0 and 1, for strehl is a share, but got 5.*Write 5 % as 0\.05"),
+        ("far_spot >= 150 %", r"min: must lie between 0 and 1, for far_spot is a share, but got 1\.5"),
+        ("zeroth_order <= -1 %", r"max: must be .*-0\.01"),
+    ],
+)
+def test_a_limit_with_an_impossible_number_is_refused_by_the_rule_that_it_breaks(text: str, rule: str):
+    with pytest.raises(InputError, match=rf'limit "{text}": {rule}'):
         limit_from_text(text)
 
 
@@ -173,6 +187,7 @@ def test_a_plate_beyond_the_model_is_bad_and_nothing_else():
     assert table.within.tolist() == [False, True, True]
     assert limited(table, []).good.tolist() == [False, True, True]
     assert table.obeys(limit_from_text("strehl >= 0")).tolist() == [False, True, True]
+    assert table.obeys(limit_from_text("strehl <= 1")).tolist() == [False, True, True]  # nor from the other side
     assert limited(table, []).worst_draw == "normal/1"
     assert limited(table, [limit_from_text("strehl >= 0.95")]).worst_draw == "normal/1"
     assert [found["min"] for found in table.statistics() if found["quantity"] == "strehl"] == [0.9, 0.9]
@@ -291,6 +306,34 @@ def test_a_result_holds_what_was_asked_for(toleranced: Callable[..., ToleranceRe
     assert {key.partition("/")[0] for key in few.keys} == {"nominal", "expected", "normal"}
     assert set(few.keys) < set(more.keys)
     assert toleranced().effects
+
+
+PICTURE = np.linspace(0.0, 1.0, 16).reshape(4, 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "other"),
+    [
+        ({"focal_length_m": np.inf, "distance_m": 0.1}, {"focal_length_m": np.inf, "distance_m": 0.2}),
+        ({"focal_length_m": np.inf, "distance_m": np.inf}, {}),
+        ({"beam": EvenBeam(np.inf)}, {"beam": EvenBeam(0.1)}),
+        ({"beam": MeasuredBeam(PICTURE, 1e-4)}, {"beam": MeasuredBeam(PICTURE[::-1], 1e-4)}),
+    ],
+    ids=["no lens", "angles", "plane wave", "measured beam"],
+)
+def test_a_study_on_disk_of_any_camera_goes_on(fakes, tmp_path: Path, change: dict[str, Any], other: dict[str, Any]):
+    """JSON has no infinity and no pictures; the folder is known again, and that of another camera is refused."""
+
+    def of(camera: dict[str, Any]) -> Study:
+        made = dataclasses.replace(fakes.design(), camera=dataclasses.replace(fakes.CAMERA, **camera))
+        asked = study(made, process=fakes.process(), evaluate=fakes.rows, out=tmp_path / "study", quiet=True)
+        return dataclasses.replace(asked, run=one_after_another)
+
+    first = of(change).monte_carlo(2)
+    again = of(change)
+    assert again.monte_carlo(2).values["strehl"].tolist() == first.values["strehl"].tolist()
+    with pytest.raises(InputError, match="one with another design"):
+        of(other).monte_carlo(2)
 
 
 def test_results_take_the_place_of_older_ones_and_of_nothing_else(

@@ -20,6 +20,7 @@ from fab.draws import (
     varying,
 )
 from fab.errors import InputError
+from fab.levels import Levels
 from fab.process import Defects, Normal, Process, Variation
 
 SIDE = 1e-3
@@ -160,6 +161,14 @@ def test_what_a_budget_is_for(process: Process, what: str, count: int):
 def test_a_budget_for_what_does_not_vary_is_refused(process: Process):
     with pytest.raises(InputError, match=r"must name errors that vary.*One of depth, overlay, .*overlay_x"):
         chosen_errors(process, "rotation")
+
+
+def test_a_refused_budget_proposes_nothing_that_would_be_refused():
+    """Roughness of a fixed size is a source of error, for every plate has another one, but has no sigma to budget."""
+    spreads = {"roughness_m": Normal(2e-9, 0.0), "overlay_x_m[0]": Normal(0.0, 1e-7)}
+    process = Process(Levels(4, 75e-9), spreads=spreads)
+    with pytest.raises(InputError, match=r'got "roughness"\. One of overlay, overlay_x\.$'):
+        chosen_errors(process, "roughness")
 
 
 @pytest.mark.parametrize(
