@@ -123,7 +123,7 @@ _EVALUATION = {
     "mean": ResultNumber("of the score", "", "mean over the test pairs", ""),
     "low": ResultNumber("of the score", "", "lower end of its 95 % bootstrap interval over photographs and seeds", ""),
     "high": ResultNumber("of the score", "", "upper end", ""),
-    "pairs": ResultNumber("count", "1 or more", "test pairs", ""),
+    "pairs": ResultNumber("count", "1 or more", "test pairs that have this score, a finite one", ""),
     "pictures": ResultNumber("count", "1 or more", "photographs that they are made of", ""),
     "seeds": ResultNumber("count", "0 or more", "trainings that the row is a mean of", ""),
     "gain": ResultNumber("of the score", "", "mean difference to the proposed row, pair by pair", ""),

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import shutil
 import sys
 from dataclasses import fields, is_dataclass
@@ -272,6 +273,20 @@ def test_a_network_is_not_judged_by_what_it_was_trained_on(run: Path, tmp_path: 
     ready, left = candidates_of((row,), plan, (0,), {}, plates, sample_files()[1:])
     assert [one.row for one in ready] == [row]
     assert left == ()
+
+
+@pytest.mark.parametrize("name", ["table2-raindrop-paper", "table2-raindrop-radiometric", "table2-fence-radiometric"])
+def test_rows_with_fewer_pairs_over_the_full_image_are_those_that_the_page_names(name: str):
+    """A picture that equals its scene has no finite PSNR; only rows that return the scene exactly have any."""
+    text = (Path(__file__).parents[2] / "examples" / "results" / f"{name}.csv").read_text()
+    full = [one for one in csv.DictReader(text.splitlines()) if (one["region"], one["score"]) == ("full", "psnr")]
+    fewer = {one["row"] for one in full if one["pairs"] != "100"}
+    assert fewer == {"biharmonic", "fourier_inpainting", "two_stream_inpainting"}
+    counts = {one["pairs"] for one in full if one["pairs"] != "100"}
+    page = (Path(__file__).parents[2] / "docs" / "validation-network.md").read_text()
+    (said,) = [part for part in page.split("\n\n") if "does not count" in part]
+    assert len(counts) == 1
+    assert counts <= set(re.findall(r"\d+", said))
 
 
 # Programs of other people.
