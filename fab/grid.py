@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any, Literal
 
 import numpy as np
@@ -45,7 +46,7 @@ class Grid:
         pitch_m: edge of one pixel, metres.
 
     Raises:
-        InputError: a count below one, or a pitch that is not from 1e-20 m to 1e20 m.
+        InputError: a count that is no integer or below one, or a pitch that is not from 1e-20 m to 1e20 m.
     """
 
     shape: tuple[int, int]
@@ -53,6 +54,9 @@ class Grid:
 
     def __post_init__(self) -> None:
         ny, nx = self.shape
+        if not all(isinstance(n, Integral) for n in (ny, nx)):
+            rule = "must count whole pixels"
+            raise InputError("grid: shape", rule, self.shape, "Give integers, such as array.shape.")
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
         if not _PITCHES_M[0] <= self.pitch_m <= _PITCHES_M[1]:

@@ -84,9 +84,13 @@ def metres(value: float | str, name: str = "length", *, infinite: bool = False) 
             return parse_length(value)
         except ValueError as error:
             raise InputError(name, rule, repr(value), cure) from error
-    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+    try:
+        number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    except OverflowError:  # an integer beyond all floats
+        number = math.inf
+    if not math.isfinite(number):
         raise InputError(name, rule, repr(value), cure)
-    return float(value)
+    return number
 
 
 def format_angle(angle_rad: float) -> str:

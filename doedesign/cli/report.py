@@ -1,6 +1,9 @@
 """The page of a run: report."""
 
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from doedesign.cli.console import print_paths, say
 from doedesign.cli.options import AsJson, Flag
@@ -10,7 +13,7 @@ from fab.errors import InputError
 def report(
     run: Path,
     *,
-    compare: tuple[Path, ...] = (),
+    compare: Annotated[tuple[Path, ...], Parameter(negative="", show_default=False)] = (),
     watch: Flag = False,
     order: Path | None = None,
     out: Path | None = None,

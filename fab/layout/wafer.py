@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import ClassVar, Literal
 
 from fab.errors import InputError
@@ -64,10 +65,12 @@ class Wafer:
             if not 0 < getattr(self, name) < 1:
                 got = format_length(getattr(self, name))
                 raise InputError(f"wafer: {name}", "must be positive and below 1 m", got, "Check its unit.")
+        if self.chrome not in ("liftoff", "etch"):  # another word would change the tone of its photomask
+            raise InputError("wafer: chrome", 'must be "liftoff" or "etch"', repr(self.chrome), "Choose one of them.")
         if self.blank_m < self.diameter_m:
             rule = f"must hold the wafer of {format_length(self.diameter_m)}"
             raise InputError("wafer: blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
-        if self.dies is not None and min(self.dies) < 1:
+        if self.dies is not None and not all(isinstance(n, Integral) and n >= 1 for n in self.dies):
             raise InputError("wafer: dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
         if self.dies is not None and self.dies[0] * self.dies[1] > MOST["placed copies"]:
             rule = f"must be at most {MOST['placed copies']} altogether"

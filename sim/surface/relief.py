@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import make_interp_spline
 
+from fab.deviations import DEVIATIONS
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.process import Process, Variation
@@ -240,3 +241,9 @@ def require_possible(grid: Grid, process: Process, variation: Variation) -> None
     if not 0 <= variation.sidewall_rad < np.pi / 4:
         rule = "must lie between 0 and 45 degrees from the vertical"
         raise InputError("variation.sidewall", rule, f"{np.degrees(variation.sidewall_rad):.3g} deg", "Correct it.")
+    for name, deviation in DEVIATIONS.items():
+        for value in np.ravel(getattr(variation, name)):
+            if not np.isfinite(value):
+                raise InputError(f"variation.{name}", "must be finite", value, "Correct it.")
+            if deviation.one_sided and value < 0:  # it would be taken for 0, or for its opposite
+                raise InputError(f"variation.{name}", "must not be negative", value, "Give 0 or more.")

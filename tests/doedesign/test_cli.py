@@ -30,6 +30,7 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]):
     assert main([*command.split(), "--help"]) == 0
     shown = capsys.readouterr().out
     assert f"doedesign {command}".strip() in shown
+    assert "--empty" not in shown  # an option that says what leaving out its opposite says
     if not command:
         assert all(name in shown for name in COMMANDS)
 

@@ -122,6 +122,9 @@ def test_measurement_places_lie_where_the_marks_are(tmp_path):
         ({"blank_m": 101e-3, "edge_exclusion_m": 1e-3}, "leave room for the labels"),
         ({"blank_m": 90e-3}, "must hold the wafer"),
         ({"dies": (0, 3)}, "1 or more rows"),
+        ({"dies": (1.5, 3)}, "1 or more rows"),
+        ({"chrome": "etched"}, 'chrome: must be "liftoff" or "etch"'),
+        ({"chrome": "none"}, 'chrome: must be "liftoff" or "etch"'),
         ({"thickness_m": -1.0}, "positive and below 1 m"),
     ],
 )

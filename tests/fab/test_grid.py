@@ -34,7 +34,10 @@ def test_pixels_in_a_circle_are_counted_as_they_are_drawn(shape, diameter_m):
     assert grid.count_inside_circle(diameter_m) == np.count_nonzero(grid.inside_circle(diameter_m))
 
 
-@pytest.mark.parametrize(("shape", "pitch_m"), [((0, 3), 1.0), ((3, 0), 1.0), ((3, 3), 0.0), ((3, 3), float("nan"))])
+@pytest.mark.parametrize(
+    ("shape", "pitch_m"),
+    [((0, 3), 1.0), ((3, 0), 1.0), ((3, 3), 0.0), ((3, 3), float("nan")), ((3.5, 3), 1.0), ((float("nan"), 3), 1.0)],
+)
 def test_impossible_grids_are_refused(shape, pitch_m):
     with pytest.raises(InputError, match="grid"):
         Grid(shape, pitch_m)
