@@ -88,8 +88,16 @@ def refuse_where(height_m: NDArray[np.floating], wrong: NDArray[np.bool_], where
         raise InputError(where, rule, f"{pixels}, the first at row {row}, column {column} ({shown})", cure)
 
 
+def require_filled(values: NDArray[Any], where: str) -> None:
+    """Raise InputError for an array of numpy.ma with masked values: what lies below them is not meant to be used."""
+    if np.ma.is_masked(values):
+        got = f"{np.ma.count_masked(values)} masked values"
+        raise InputError(where, "every pixel must have a value", got, "Fill them, as array.filled(0) does.")
+
+
 def require_heights(height_m: NDArray[Any], where: str) -> None:
     """Check that an array can be a height map: two-dimensional, filled, float32 or float64, finite and not negative."""
+    require_filled(height_m, where)
     if height_m.ndim != 2 or height_m.size == 0 or height_m.dtype not in (np.float32, np.float64):
         got = f"{height_m.dtype} of shape {height_m.shape}"
         rule = "must be a filled two-dimensional array of float32 or float64"

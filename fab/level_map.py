@@ -19,7 +19,7 @@ from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import sha256_bytes
 from fab.grid import Grid
-from fab.height import HeightMap
+from fab.height import HeightMap, require_filled
 from fab.levels import Levels, height_of, level_map_from_planes, planes, quantise, quantise_wrapped, require_levels
 from fab.units import format_length
 
@@ -57,6 +57,7 @@ class LevelMap:
     name: str = "doe"
 
     def __post_init__(self) -> None:
+        require_filled(self.level, "level map")
         checked = require_levels(np.asarray(self.level), self.levels)
         if checked.shape != self.grid.shape:
             rule = f"must have the grid's shape {self.grid.shape}"

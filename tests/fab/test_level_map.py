@@ -27,6 +27,17 @@ def test_glass_is_blank_outside_the_aperture_and_as_given_inside():
     assert not inside.all()
 
 
+def test_masked_pixels_are_refused():
+    """What lies under the mask of an array of numpy.ma would count as glass."""
+    grid, mask = Grid((4, 4), 1e-6), np.eye(4, dtype=bool)
+    with pytest.raises(InputError, match=r"level map: every pixel must have a value, but got 4 masked values\. Fill"):
+        LevelMap(np.ma.array(np.ones((4, 4), np.uint8), mask=mask), Levels(4, 0.3e-6), grid, 4e-6)
+    with pytest.raises(InputError, match=r"height map: every pixel must have a value"):
+        HeightMap(np.ma.array(np.full((4, 4), 1e-7), mask=mask), grid, 4e-6)
+    whole = np.ma.array(np.ones((4, 4), np.uint8))  # without masked pixels it is an array like any other
+    assert LevelMap(whole, Levels(4, 0.3e-6), grid, 4e-6).level[2, 2] == 1
+
+
 def test_heights_are_derived_and_nothing_can_be_written():
     made = random_map()
     assert np.allclose(made.height_m, made.level * 75e-9, rtol=1e-7)  # float32
