@@ -40,7 +40,7 @@ def test_clumps_are_narrower_than_they_are_apart():
         drawn = Dirt(clump_m=(clump_m, clump_m)).draw(np.random.default_rng(seed), view, dark)
         rows = np.pad(np.asarray(drawn.mask) >= 0.5, ((0, 0), (1, 1))).astype(int)
         steps = np.diff(rows, axis=1)
-        ways = (np.nonzero(steps < 0)[1] - np.nonzero(steps > 0)[1]) * view.pixel_at_m(drawn.depth_m)
+        ways = (np.nonzero(steps < 0)[1] - np.nonzero(steps > 0)[1]) * view.pixel_at_m(float(drawn.depth_m))
         longest.append(np.sum(ways**2) / np.sum(ways))
     # Seeds differ by 0.14, their mean by 0.04.
     assert np.mean(longest) / clump_m == pytest.approx(0.6, abs=0.1)
