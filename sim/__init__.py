@@ -5,8 +5,9 @@ Reading order, from the substance to the picture:
     material    refractive index of the DOE substrate, and its Fresnel loss
     aperture    the clear aperture: how much of each DOE cell is open
     illumination beams that light the DOE
-    camera      lens and sensor; the wave a source sends into the aperture
-    source      that wave as arrays for one wavelength, depth and field angle
+    lens        where the light of a direction lands: sine or tangent, distortion
+    camera      lens and sensor, and the light that arrives
+    source      the path from a source to the cells, for one wavelength, depth and field angle
     propagation pupil -> pixel energies: the far field (eqs. 7-9 of the paper), for rings, and the direct path (eq. 5)
     optic       whatever images a point source: height maps and rings
     rigorous    Maxwell's equations for rows of cells, and height maps with the light of their walls (`with_edges`)

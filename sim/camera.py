@@ -1,4 +1,4 @@
-"""Lens, sensor and DOE substrate of a camera, and the wave a source sends into its aperture.
+"""Lens, sensor and DOE substrate of a camera, and the light that arrives at it.
 
 The DOE sits on a thin lens in the aperture plane (paper §3.1). For a sensor at the focal distance the lens cancels the
 quadratic term of Fresnel propagation and only the source's own path differences and the DOE remain (eq. 7); a sensor
@@ -6,9 +6,7 @@ out of focus, or one without a lens, leaves a quadratic remainder, which is adde
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -18,15 +16,10 @@ from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.units import DEGREES, PlaceUnit, format_length
-from sim.illumination import Beam, beam_amplitude, beam_irradiance, path_from_point_m
+from sim.illumination import Beam, beam_amplitude, beam_irradiance
+from sim.lens import IDEAL, Distortion, Mapping, check_lens, direction_sines, image_place, sines_at
 from sim.material import fresnel_transmission, refractive_index
 
-Mapping = Literal["sine", "tangent"]
-Distortion = tuple[float, float]
-IDEAL: Distortion = (0.0, 0.0)
-_INVERSIONS = 8  # steps of Newton's method that undo a distortion; five reach double precision for 20 %
-# How far beyond the corners of a window the image must not be folded over: light is looked for a little outside.
-_MARGIN = 1.2
 _PARAXIAL = 0.02  # wave
 # Without a lens an image is that of the axis, moved, while an oblique chief ray adds less than so much of a wave of
 # astigmatism and coma at the rim (a Strehl ratio above 0.98) and of the distances of places.
@@ -353,145 +346,3 @@ class Camera:
 
 def _sum(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
     return one[0] + other[0], one[1] + other[1]
-
-
-def image_place(mapping: Mapping, distortion: Distortion, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
-    """Place (y, x) of light with direction sines (y, x), as a share of the sensor's distance; see `Camera`."""
-    y, x = sine_y, sine_x
-    if mapping == "tangent":
-        longer = (1.0 - y * y - x * x) ** -0.5
-        y, x = y * longer, x * longer
-    (k1, k2), square = distortion, y * y + x * x
-    grown = 1.0 + square * (k1 + k2 * square)
-    return y * grown, x * grown
-
-
-def sines_at(mapping: Mapping, distortion: Distortion, y: Any, x: Any) -> tuple[Any, Any]:
-    """Direction sines (y, x) of light from its place, a share of the sensor's distance: the inverse of `image_place`.
-
-    Plain arithmetic, for numbers and arrays of numpy or jax. Meaningless where the image is folded over
-    (`farthest_place`).
-    """
-    (k1, k2), seen, shrunk = distortion, y * y + x * x, 1.0
-    for _ in range(_INVERSIONS if any(distortion) else 0):
-        square = seen * shrunk * shrunk
-        missed = shrunk * (1.0 + square * (k1 + k2 * square)) - 1.0
-        shrunk = shrunk - missed / (1.0 + square * (3.0 * k1 + 5.0 * k2 * square))
-    y, x = y * shrunk, x * shrunk
-    if mapping == "tangent":
-        shorter = (1.0 + y * y + x * x) ** -0.5
-        y, x = y * shorter, x * shorter
-    return y, x
-
-
-def farthest_place(mapping: Mapping, distortion: Distortion) -> float:
-    """Distance from the axis up to which every place sees a direction of its own, or infinity.
-
-    Beyond, a distortion folds the image over, or light would have to come from more than 90 degrees.
-    """
-    k1, k2 = distortion
-    # The height p (1 + k1 p² + k2 p⁴) stops growing where 1 + 3 k1 q + 5 k2 q² = 0 at q = p².
-    turns = [1.0 if mapping == "sine" else math.inf]
-    if k2:
-        root = 9 * k1**2 - 20 * k2
-        turns += [(-3 * k1 + sign * math.sqrt(root)) / (10 * k2) for sign in (-1, 1) if root >= 0]
-    elif k1:
-        turns.append(-1 / (3 * k1))
-    square = min(turn for turn in turns if turn > 0)
-    return math.inf if math.isinf(square) else math.sqrt(square) * (1 + square * (k1 + k2 * square))
-
-
-def check_lens(mapping: str, distortion: Distortion, corner: float, key: Callable[[str], str] = str) -> None:
-    """Raise an `InputError` for a lens that cannot image a window whose corners lie `corner` from the axis.
-
-    `key` writes the names of the two values, "mapping" and "distortion", as the user knows them.
-    """
-    if mapping not in get_args(Mapping):
-        rule = f"must be one of {', '.join(get_args(Mapping))}"
-        raise InputError(key("mapping"), rule, repr(mapping), 'Use "tangent" for a lens without distortion.')
-    if len(distortion) != 2 or not all(map(math.isfinite, distortion)):
-        rule = "must be two finite numbers, k1 and k2"
-        raise InputError(key("distortion"), rule, f"{distortion}", "Use (0, 0) for none.")
-    if mapping == "sine" and not any(distortion):
-        return
-    farthest = farthest_place(mapping, distortion)  # pyright: ignore[reportArgumentType]
-    if farthest < _MARGIN * corner:
-        rule = (
-            f"the image must not fold over within {_MARGIN:g} times the distance of the window's corners from the axis"
-        )
-        got = f"k1, k2 = {distortion[0]:g}, {distortion[1]:g}: at {farthest:.3g} sensor distances, with corners "
-        cure = "Use weaker distortion or a smaller window."
-        raise InputError(key("distortion"), rule, f"{got}at {corner:.3g}", cure)
-
-
-def direction_sines(field_rad: tuple[float, float]) -> Float[np.ndarray, "2"]:
-    """Direction sines (y, x) of the chief ray for field angles (y, x) in radians.
-
-    The angles are those of its projections on the yz and xz planes, positive where light travels toward +y or +x.
-    """
-    tangents = np.tan(np.asarray(field_rad, dtype=np.float64))
-    return tangents / np.sqrt(1.0 + np.sum(tangents**2))
-
-
-def source_path_m(
-    camera: Camera, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
-) -> Float[np.ndarray, "y x"]:
-    """Optical path from a point source to every DOE cell, relative to the chief ray, metres in float64.
-
-    Eq. 1 of the paper with the constant subtracted, plus r^2/2 times `Camera.curvature_per_m`, which is 1/d - 1/f for a
-    sensor at distance d. The linear path of field angles (y, x), the tilt that moves the image, is removed: the window
-    follows the chief ray.
-    """
-    return _whole(_distinct_path_m(camera, depth_m, field_rad), camera.grid.shape)
-
-
-def source_waves(
-    camera: Camera, wavelength_m: float, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
-) -> Float[np.ndarray, "y x"]:
-    """`source_path_m` in waves, as `wrapped_waves` has it."""
-    return _whole(wrapped_waves(_distinct_path_m(camera, depth_m, field_rad), wavelength_m), camera.grid.shape)
-
-
-# Colours of one depth share the path, and so do those who look at a PSF in several ways; arrays are read-only.
-@lru_cache(maxsize=4)
-def _distinct_path_m(camera: Camera, depth_m: float, field_rad: tuple[float, float]) -> Float[np.ndarray, "v u"]:
-    """`source_path_m` to cells from which all follow: on the axis those of a quarter, else all."""
-    y, x = (camera.grid.axis_m(axis) for axis in ("y", "x"))
-    if not any(field_rad):
-        y, x = y[len(y) // 2 :], x[len(x) // 2 :]
-    path = path_at_m(camera, y[:, None], x, depth_m, field_rad)
-    path.setflags(write=False)
-    return path
-
-
-def _whole(distinct: Float[np.ndarray, "v u"], shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:
-    """Values of all cells, of those of a quarter or of all."""
-    if distinct.shape == shape:
-        return distinct
-    across_y, across_x = (np.abs(np.arange(1 - count, count, 2)) // 2 for count in shape)
-    return distinct[across_y[:, None], across_x]
-
-
-def path_at_m(
-    camera: Camera,
-    y_m: Float[np.ndarray, "*s"],
-    x_m: Float[np.ndarray, "*t"],
-    depth_m: float,
-    field_rad: tuple[float, float] = (0.0, 0.0),
-) -> Float[np.ndarray, "*u"]:
-    """`source_path_m` at any points (y, x) of the aperture, broadcast against each other."""
-    square = y_m**2 + x_m**2
-    defocus = (square / 2) * camera.curvature_per_m()
-    if np.isinf(depth_m):
-        return defocus
-    return path_from_point_m(y_m, x_m, depth_m, field_rad) + defocus
-
-
-def wrapped_waves(path_m: Float[np.ndarray, "*s"], wavelength_m: float) -> Float[np.ndarray, "*s"]:
-    """Path in waves, wrapped to [-1/2, 1/2] in float64 and only then rounded to float32.
-
-    5 cm from a 4.4 mm aperture the path is a hundred waves; float32 would leave 1e-5 of them.
-    """
-    waves = path_m / wavelength_m
-    waves -= np.round(waves)
-    return waves.astype(np.float32)

@@ -1,6 +1,6 @@
 """Point sources: the optical path from a source to the cells of a DOE, for one wavelength, depth and field angle.
 
-`SourceMap` holds the path to every cell, wrapped in double precision on the host (`sim.camera.source_waves`).
+`SourceMap` holds the path to every cell, wrapped in double precision on the host (`source_waves`).
 
 `SeparableSource` describes it by a few numbers and two rows of phase, so that one compiled step serves every depth. The
 path from side to side of the aperture is a hundred waves. All but a few of them are a parabola, and a parabola is a sum
@@ -13,6 +13,7 @@ free of cancellation and small enough for single precision.
 """
 
 import itertools
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,9 +22,75 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from fab.grid import Grid
-from sim.camera import Camera, direction_sines, source_waves, wrapped_waves
+from sim.camera import Camera
+from sim.illumination import path_from_point_m
+from sim.lens import direction_sines
 
 Real = Array | np.ndarray | np.float32
+
+
+def source_path_m(
+    camera: Camera, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
+) -> Float[np.ndarray, "y x"]:
+    """Optical path from a point source to every DOE cell, relative to the chief ray, metres in float64.
+
+    Eq. 1 of the paper with the constant subtracted, plus r^2/2 times `Camera.curvature_per_m`, which is 1/d - 1/f for a
+    sensor at distance d. The linear path of field angles (y, x), the tilt that moves the image, is removed: the window
+    follows the chief ray.
+    """
+    return _whole(_distinct_path_m(camera, depth_m, field_rad), camera.grid.shape)
+
+
+def source_waves(
+    camera: Camera, wavelength_m: float, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
+) -> Float[np.ndarray, "y x"]:
+    """`source_path_m` in waves, as `wrapped_waves` has it."""
+    return _whole(wrapped_waves(_distinct_path_m(camera, depth_m, field_rad), wavelength_m), camera.grid.shape)
+
+
+# Colours of one depth share the path, and so do those who look at a PSF in several ways; arrays are read-only.
+@lru_cache(maxsize=4)
+def _distinct_path_m(camera: Camera, depth_m: float, field_rad: tuple[float, float]) -> Float[np.ndarray, "v u"]:
+    """`source_path_m` to cells from which all follow: on the axis those of a quarter, else all."""
+    y, x = (camera.grid.axis_m(axis) for axis in ("y", "x"))
+    if not any(field_rad):
+        y, x = y[len(y) // 2 :], x[len(x) // 2 :]
+    path = path_at_m(camera, y[:, None], x, depth_m, field_rad)
+    path.setflags(write=False)
+    return path
+
+
+def _whole(distinct: Float[np.ndarray, "v u"], shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:
+    """Values of all cells, of those of a quarter or of all."""
+    if distinct.shape == shape:
+        return distinct
+    across_y, across_x = (np.abs(np.arange(1 - count, count, 2)) // 2 for count in shape)
+    return distinct[across_y[:, None], across_x]
+
+
+def path_at_m(
+    camera: Camera,
+    y_m: Float[np.ndarray, "*s"],
+    x_m: Float[np.ndarray, "*t"],
+    depth_m: float,
+    field_rad: tuple[float, float] = (0.0, 0.0),
+) -> Float[np.ndarray, "*u"]:
+    """`source_path_m` at any points (y, x) of the aperture, broadcast against each other."""
+    square = y_m**2 + x_m**2
+    defocus = (square / 2) * camera.curvature_per_m()
+    if np.isinf(depth_m):
+        return defocus
+    return path_from_point_m(y_m, x_m, depth_m, field_rad) + defocus
+
+
+def wrapped_waves(path_m: Float[np.ndarray, "*s"], wavelength_m: float) -> Float[np.ndarray, "*s"]:
+    """Path in waves, wrapped to [-1/2, 1/2] in float64 and only then rounded to float32.
+
+    5 cm from a 4.4 mm aperture the path is a hundred waves; float32 would leave 1e-5 of them.
+    """
+    waves = path_m / wavelength_m
+    waves -= np.round(waves)
+    return waves.astype(np.float32)
 
 
 class MapColumns(NamedTuple):

@@ -23,9 +23,10 @@ from doedesign.calibration.geometry import UPRIGHT, GeometryPrior, displacement_
 from doedesign.calibration.target import Image
 from doedesign.calibration.unknowns import Unknowns
 from fab.grid import Grid
-from sim.camera import Camera, source_waves
+from sim.camera import Camera
 from sim.propagation.farfield import FarField, bent, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
+from sim.source import source_waves
 from sim.surface import as_fabricated
 
 # Of an image: shifts along y and x in pixels, defocus in 1/m, and the camera's geometry (`QUANTITIES`).

@@ -19,12 +19,14 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.aperture import RoundAperture
-from sim.camera import Camera, Mapping, SpectralLine, path_at_m
+from sim.camera import Camera, SpectralLine
+from sim.lens import Mapping
 from sim.metrics import mean_wavelength_m
 from sim.optic import HeightOptic
 from sim.propagation.farfield import FarField
 from sim.psf_bank import PsfBank, psf
 from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
+from sim.source import path_at_m
 from sim.threads import at_once
 
 _SIDE = 16  # directions per axis, one in each part of the window

@@ -19,7 +19,7 @@ from doedesign.spec.values.table import toml_key
 from fab.aperture import MaskAperture
 from fab.errors import InputError
 from fab.units import MICROMETRES, format_length
-from sim.camera import check_lens
+from sim.lens import check_lens
 from sim.material import refractive_index
 
 # Keys of a beam of each kind: those that it needs, and those that it may have besides.

@@ -8,7 +8,7 @@ from doedesign.spec.models import Spec
 from fab.aperture import MaskAperture
 from fab.errors import InputError
 from fab.units import DEGREES, MICROMETRES, NM, format_length
-from sim.camera import image_place
+from sim.lens import image_place
 from sim.material import full_wave_height_m, full_wave_wavelength_m
 
 _WAVE_TOLERANCE = 0.02

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.fft import fft
 
-from sim.camera import Colour, source_path_m
+from sim.camera import Colour
 from sim.metrics.measures import far_spot
 from sim.optic import CellOptic
+from sim.source import source_path_m
 from sim.tracing import total
 
 

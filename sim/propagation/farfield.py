@@ -45,7 +45,8 @@ from scipy.fft import next_fast_len
 from fab.aperture import RoundAperture
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera, direction_sines
+from sim.camera import Camera
+from sim.lens import direction_sines
 from sim.propagation.field_weights import FIELD_TAPS, field_weights
 from sim.propagation.mapped import MappedPixels, plan_mapped_pixels
 from sim.propagation.pixel import Banded, PixelWeights, pixel_weights, sampling_for

@@ -19,9 +19,10 @@ from scipy.fft import next_fast_len
 
 from fab.aperture import RoundAperture
 from fab.errors import InputError
-from sim.camera import Camera, wrapped_waves
+from sim.camera import Camera
 from sim.propagation.pixel import Banded, pixel_weights
 from sim.propagation.pupil import PupilRows, cis
+from sim.source import wrapped_waves
 
 Kernel = Literal["fresnel", "angular_spectrum"]
 

@@ -19,9 +19,10 @@ from jaxtyping import Array, Float, Int
 from scipy.special import j1
 
 from fab.grid import Grid
-from sim.camera import Camera, path_at_m, wrapped_waves
+from sim.camera import Camera
 from sim.propagation.pixel import Banded
 from sim.propagation.pupil import cis
+from sim.source import path_at_m, wrapped_waves
 
 _OVERSAMPLING = 2.2  # radii per lambda d / D; the field's band needs 1
 _REFINEMENT = 8  # fine radii per coarse radius; intensity is then linear between them to 1e-3

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim.camera import Camera, direction_sines
+from sim.camera import Camera
+from sim.lens import direction_sines
 from sim.propagation.mapped import PlaceMap
 
 CUBIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))

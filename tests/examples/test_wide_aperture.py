@@ -10,7 +10,7 @@ import pytest
 
 from doedesign.capture.images import Pictures, sample_files
 from doedesign.spec import load_spec
-from sim.camera import path_at_m
+from sim.source import path_at_m
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 

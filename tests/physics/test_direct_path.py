@@ -9,11 +9,11 @@ from scipy.special import fresnel
 
 from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.aperture import circle_coverage
-from sim.camera import Camera, source_path_m, wrapped_waves
+from sim.camera import Camera
 from sim.propagation.fresnel import Kernel, plan_direct
 from sim.propagation.pupil import DoeRows, doe_field
 from sim.psf_bank import psf
-from sim.source import MapColumns
+from sim.source import MapColumns, source_path_m, wrapped_waves
 
 NO_LENS_M = 1e5  # focal length whose curvature over half a millimetre is 1e-6 of a wave
 

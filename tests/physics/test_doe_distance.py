@@ -13,11 +13,11 @@ import pytest
 
 from fab.errors import InputError
 from fab.grid import Grid
-from sim.camera import Camera, Colour, source_path_m, wrapped_waves
+from sim.camera import Camera, Colour
 from sim.propagation.farfield import plan_far_field
 from sim.propagation.fresnel import plan_direct
 from sim.propagation.pupil import DoeRows, doe_field
-from sim.source import MapColumns
+from sim.source import MapColumns, source_path_m, wrapped_waves
 
 WAVELENGTH_M, CELLS, PITCH_M, PIXEL_M, WINDOW, FOCAL_M, DEPTH_M = 550e-9, 48, 2e-6, 3.7e-6, 32, 2e-3, 20e-3
 ONE = (Colour("one", (WAVELENGTH_M,), (1.0,)),)

@@ -18,7 +18,8 @@ from scipy.special import j0
 from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera, Colour, check_lens
+from sim.camera import Camera, Colour
+from sim.lens import check_lens
 from sim.optic import HeightOptic, RingOptic
 from sim.propagation.farfield import bent, displaced, plan_far_field
 from sim.propagation.fresnel import plan_direct

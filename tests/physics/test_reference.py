@@ -7,10 +7,11 @@ from scipy.ndimage import gaussian_filter1d
 
 from bench.reference import make_camera, oversampled_psf, relative_error, wrapped_map
 from sim.aperture import circle_coverage
-from sim.camera import Camera, source_path_m
+from sim.camera import Camera
 from sim.propagation.farfield import plan_far_field
 from sim.propagation.hankel import plan_hankel, revolve, ring_count, ring_source_waves
 from sim.psf_bank import psf
+from sim.source import source_path_m
 
 
 def field64(camera: Camera, height: np.ndarray, depth_m: float, wavelength_m: float) -> np.ndarray:

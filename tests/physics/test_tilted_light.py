@@ -15,8 +15,9 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import Process, Variation
-from sim.camera import Camera, direction_sines
+from sim.camera import Camera
 from sim.illumination import EvenBeam, GaussianBeam
+from sim.lens import direction_sines
 from sim.metrics import energy_budget
 from sim.optic import HeightOptic
 from sim.propagation.farfield import bent, plan_far_field

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from bench.reference import make_camera
-from sim.camera import direction_sines, path_at_m, source_path_m, wrapped_waves
+from sim.lens import direction_sines
 from sim.material import refractive_index
+from sim.source import path_at_m, source_path_m, wrapped_waves
 
 CAMERA = make_camera(64, 4.4e-3, 8e-3, 3.7e-6, 32)
 

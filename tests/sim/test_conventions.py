@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from bench.reference import YELLOW_M, make_camera
-from sim.camera import Camera, path_at_m
+from sim.camera import Camera
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
+from sim.source import path_at_m
 
 
 def peak(image: np.ndarray) -> tuple[int, int]:

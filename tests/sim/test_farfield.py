@@ -8,11 +8,11 @@ import pytest
 from bench.reference import YELLOW_M, make_camera, relative_error, wrapped_map
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera, source_path_m, wrapped_waves
+from sim.camera import Camera
 from sim.propagation.farfield import TOLERANCE, FarField, displaced, plan_far_field
 from sim.propagation.pixel import Banded
 from sim.propagation.pupil import DoeRows, doe_field
-from sim.source import MapColumns
+from sim.source import MapColumns, source_path_m, wrapped_waves
 
 # The airy disc is as wide against the pixel as in the paper's camera (f/1.8, 1.85 um).
 PLANS = {

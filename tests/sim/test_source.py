@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fab.grid import Grid
-from sim.camera import Camera, Colour, source_path_m
+from sim.camera import Camera, Colour
 from sim.optic import HeightOptic
 from sim.propagation.pupil import doe_field
-from sim.source import SeparableSource, SourceMap
+from sim.source import SeparableSource, SourceMap, source_path_m
 
 LINES = (656e-9, 486e-9)
 

@@ -10,7 +10,7 @@ from doedesign.spec.values import PLACE, SIZE, ColourName, NotNegative, length, 
 from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.errors import InputError
 from fab.units import DEGREES, MICROMETRES, UM, format_length
-from sim.camera import sines_at
+from sim.lens import sines_at
 
 if TYPE_CHECKING:
     from doedesign.spec.models import Spec

@@ -15,8 +15,8 @@ from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.aperture import RoundAperture
 from fab.errors import InputError
 from fab.units import MICROMETRES, MM, UM, format_length
-from sim.camera import sines_at
 from sim.illumination import GaussianBeam
+from sim.lens import sines_at
 
 if TYPE_CHECKING:
     from doedesign.spec.models import Spec
