@@ -141,18 +141,23 @@ def directional_mtf(
     angles = np.arange(_AZIMUTHS) * np.pi / _AZIMUTHS
     y, x = (np.outer(way, frequencies_per_m) for way in (np.sin(angles), np.cos(angles)))
     otf = np.zeros((len(camera.colours), *y.shape), np.complex128)
-    for line in camera.lines:
-        field = np.asarray(doe.field(line, depth_m))
+    modes = len(camera.shares)
+    for first in range(0, len(camera.lines), modes):
+        alike = camera.lines[first : first + modes]  # one wavelength of one colour
+        line, fields = alike[0], (np.asarray(doe.field(each, depth_m)) for each in alike)
         per_cell = line.wavelength_m * camera.sensor_distance_m / camera.grid.pitch_m
-        most = min(math.ceil(per_cell * frequencies_per_m[-1]) + 1, max(field.shape))
+        most = min(math.ceil(per_cell * frequencies_per_m[-1]) + 1, max(camera.grid.shape))
         # Far enough that no lag that is asked for comes round from the other side.
-        shape = [next_fast_len(n + most) for n in field.shape]
-        spectrum: Any = fft2(field, shape, workers=-1)
-        correlation = np.asarray(ifft2(spectrum.real**2 + spectrum.imag**2, workers=-1))
+        shape = [next_fast_len(n + most) for n in camera.grid.shape]
+        power: Any = 0.0
+        for share, field in zip(camera.shares, fields, strict=True):  # modes add up as they pass the opening
+            spectrum: Any = fft2(field, shape, workers=-1)
+            power = power + share * (spectrum.real**2 + spectrum.imag**2)
+        correlation = np.asarray(ifft2(power, workers=-1))
         around = np.arange(-most, most + 1)
         part: Any = correlation[np.ix_(around, around)] / correlation[0, 0].real
         places = [lag * per_cell + most for lag in (y, x)]
-        weight = line.factor / camera.transmission(line.wavelength_m)
+        weight = sum(each.factor for each in alike) / camera.transmission(line.wavelength_m)
         for unit, values in ((1, part.real), (1j, part.imag)):
             otf[line.colour] += weight * unit * map_coordinates(values.astype(np.float64), places, order=1)
     side = camera.pixel_m * camera.fill
