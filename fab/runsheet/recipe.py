@@ -63,9 +63,10 @@ def depths_m(levels: Levels, etches_m: Sequence[float] = ()) -> tuple[float, ...
 
 
 def expected_m(photomask: Photomask, process: Process) -> float:
-    """Return the depth that an etch is expected to have: its target, and the mean errors of depth of a process."""
+    """Return the depth that an etch is expected to have beside the DOE: its target, and a process's mean errors."""
     names = "common_depth_scale", f"depth_scale[{photomask.bit}]"
-    return photomask.depth_m * math.prod(1 + process.spreads.get(name, Normal()).mean for name in names)
+    means = math.prod(1 + process.spreads.get(name, Normal()).mean for name in names)
+    return photomask.depth_m * means * process.depth_at_die
 
 
 def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:

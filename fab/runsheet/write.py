@@ -6,7 +6,7 @@ The same sheet comes as a page to print and write on, and as JSON. What was writ
 
 import base64
 from collections.abc import Iterator, Mapping
-from math import degrees
+from math import degrees, hypot
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -65,8 +65,13 @@ def _named(sheet: RunSheet, what: str, photomask: Photomask) -> Iterator[tuple[s
             yield where, _mm(place)
 
 
-def _first_place(sheet: RunSheet, what: str, photomask: Photomask) -> dict[str, Any]:
-    where, place = next(_named(sheet, f"{what}, ", photomask), ("", {"x_mm": None, "y_mm": None}))
+def _nearest_place(sheet: RunSheet, what: str, photomask: Photomask) -> dict[str, Any]:
+    """Where to measure: nearest to the DOE that is predicted, whose errors the measurements will be taken for."""
+    y, x = (at / MM for at in sheet.process.die_m)
+    places = list(_named(sheet, f"{what}, ", photomask))
+    if not places:
+        return {"where": "", "x_mm": None, "y_mm": None}
+    where, place = min(places, key=lambda named: hypot(named[1]["x_mm"] - x, named[1]["y_mm"] - y))
     return {"where": where, **place}
 
 
@@ -88,7 +93,7 @@ def _width_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
                 # Both edges of a bar move.
                 "tolerance_um": round(2 * _TWO_SIGMA * sigma / UM, 3) or None,
                 "below_process": bool(drawn_m < smallest * (1 - 1e-9)),
-                **_first_place(sheet, f"CD {name}", photomask),
+                **_nearest_place(sheet, f"CD {name}", photomask),
             }
         )
     return rows
@@ -102,7 +107,7 @@ def _depth_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
             "target_nm": _nm(photomask.depth_m),
             # A pad loses the share lag x depth / width of its depth.
             "expected_nm": round(aim_m * (1 - lag * aim_m / side_m) / NM, 2),
-            **_first_place(sheet, f"depth pad {name}", photomask),
+            **_nearest_place(sheet, f"depth pad {name}", photomask),
         }
         for name, side_m in PADS.items()
     ]

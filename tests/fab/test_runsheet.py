@@ -248,6 +248,26 @@ def test_what_the_process_is_known_to_do_to_depths_is_expected_and_not_undone():
     assert "(expected:" not in page_of(record(sheet())).text
 
 
+def test_pads_are_measured_near_the_doe_and_expected_as_deep_as_it():
+    """A mean bowl of 4 % at 25 of 50 mm: 1 % more than in the middle, which `masks --as-built` takes off again."""
+    levels = Levels(4, 75 * NM)
+    spreads, at = {"radial_nonuniformity": Normal(0.04)}, {"die_m": (25e-3, 0.0), "wafer_radius_m": 50e-3}
+    made = sheet(levels, spreads=spreads)
+    own = {name: place for name, place in made.places.items() if ": " not in name}  # of a monitor
+    monitors = {"centre": (0.0, 20e-3), "upper": (0.0, 40e-3), "right": (25e-3, 20e-3)}  # from that of `sheet`
+    moved = {f"{where} monitor: {name}": (x + dx, y + dy)
+             for where, (dx, dy) in monitors.items() for name, (x, y) in own.items()}  # fmt: skip
+    made = replace(made, places=moved)
+    middle, there = (
+        record(replace(made, process=process))["steps"][0]
+        for process in (made.process, replace(made.process, **at))
+    )  # fmt: skip
+    for step, deep, where in ((middle, 75.0, "centre monitor"), (there, 75.75, "upper monitor")):
+        assert step["etch"]["expected_nm"] == deep
+        assert [(row["expected_nm"], row["where"]) for row in step["etch"]["pads"]] == [(deep, where)] * 3
+        assert {row["where"] for row in step["widths"]} == {where}
+
+
 def test_depth_pads_say_what_etch_lag_does():
     levels = Levels(16, 75 * NM)
     pads = record(sheet(levels, spreads=spreads_of(levels, etch_lag=(0.1, 0.0))))["steps"][3]["etch"]["pads"]
