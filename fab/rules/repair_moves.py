@@ -172,45 +172,48 @@ def loss(task, y0, x0, y1, x1):  # pragma: no cover - compiled
 def _depths_near(task, y, x, reach, out):  # pragma: no cover - compiled
     # The depths that a pixel may take, each once: the one that is wanted and those of the pixels around it.
     out[0] = task.wanted[y, x]
-    used = 1
+    used, known = 1, np.uint64(1) << np.uint64(task.wanted[y, x])
     for far in (1, reach):
         for dy in range(-far, far + 1, far):
             for dx in range(-far, far + 1, far):
-                depth = task.etched[y + dy, x + dx]
-                known = False
-                for i in range(used):
-                    known |= out[i] == depth
-                if not known:
+                depth = np.uint64(task.etched[y + dy, x + dx])
+                if not known >> depth & np.uint64(1):
+                    known |= np.uint64(1) << depth
                     out[used] = depth
                     used += 1
     return used
 
 
 @njit(cache=True, nogil=True)
-def _filled_loss(task, y0, x0, y1, x1, depth, most):  # pragma: no cover - compiled
-    # `loss` of a rectangle if all of it had one depth, or any number that is not below `most` where that is not. For
-    # this nothing need be written: there are walls around the rectangle alone.
-    etched, wanted, wall, error = task.etched, task.wanted, task.wall, task.error
-    total = 0.0
+def _fill_losses(task, walls, y0, x0, y1, x1, losses):  # pragma: no cover - compiled
+    # `loss` of a rectangle if all of it had one depth, for every depth: there are walls around it alone.
+    etched, wanted, error = task.etched, task.wanted, task.error
+    count = len(losses)
+    for depth in range(count):
+        losses[depth] = 0.0
     for y in range(y0, y1):
         for x in range(x0, x1):
-            total += error[depth, wanted[y, x]]
-    if wall.size and total < most:
+            own = wanted[y, x]
+            for depth in range(count):
+                losses[depth] += error[own, depth]  # how far a is from b is how far b is from a
+    if walls.size:
         for y in range(y0, y1):
-            total += wall[depth ^ etched[y, x0 - 1]] + wall[depth ^ etched[y, x1]]
+            left, right = etched[y, x0 - 1], etched[y, x1]
+            for depth in range(count):
+                losses[depth] += walls[left, depth] + walls[right, depth]
         for x in range(x0, x1):
-            total += wall[depth ^ etched[y0 - 1, x]] + wall[depth ^ etched[y1, x]]
-    return total
+            below, above = etched[y0 - 1, x], etched[y1, x]
+            for depth in range(count):
+                losses[depth] += walls[below, depth] + walls[above, depth]
 
 
 @njit(cache=True, nogil=True)
-def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
+def _improve(task, walls, scratch, y, x, weight, sound):  # pragma: no cover - compiled
     # Take the best of the moves that cover a pixel; tell whether there was one.
     etched = task.etched
     reach = max(task.line, task.space, 2)
-    depths = np.empty(19, np.int64)
+    depths, kept, losses = scratch
     many = _depths_near(task, y, x, reach, depths)
-    kept = np.empty((reach, reach), etched.dtype)
     best, best_depth = -1e-9, -1
     best_y = best_x = best_high = best_wide = 0
     # The pixel alone, and lines and a square with the pixel at one of their ends or corners.
@@ -224,7 +227,6 @@ def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
         for v in range(max(y0, 0), min(y1, etched.shape[0])):
             for u in range(max(x0, 0), min(x1, etched.shape[1])):
                 allowed &= task.free[v, u]
-                kept[v - y0, u - x0] = etched[v, u]
         if not allowed:
             continue
         before = loss(task, y0, x0, y1, x1)
@@ -233,11 +235,16 @@ def _improve(task, y, x, weight, sound):  # pragma: no cover - compiled
         if -before >= best:  # no move leaves less than nothing
             continue
         written = False
+        _fill_losses(task, walls, y0, x0, y1, x1, losses)
         for i in range(many):
-            change = _filled_loss(task, y0, x0, y1, x1, depths[i], before + best) - before
+            change = losses[depths[i]] - before
             # A move that costs more light than it can repair is not checked against the rules.
             if change < best:
-                etched[y0:y1, x0:x1] = depths[i]
+                for v in range(y0, y1):
+                    for u in range(x0, x1):
+                        if not written:
+                            kept[v - y0, u - x0] = etched[v, u]
+                        etched[v, u] = depths[i]
                 written = True
                 if not sound:
                     change += weight * broken(task, y0, x0, y1, x1)
@@ -264,7 +271,13 @@ def sweep(task, first, last, weight, changed_too, sound):  # pragma: no cover - 
     map that breaks no rule is `sound`, and stays so if the weight of a broken rule is more than any light: nothing
     offends, and no move has anything to repair.
     """
-    etched = task.etched
+    etched, count = task.etched, task.error.shape[0]
+    reach = max(task.line, task.space, 2)
+    scratch = np.empty(19, np.int64), np.empty((reach, reach), etched.dtype), np.empty(count)
+    walls = np.empty((count, count) if task.wall.size else (0, 0))
+    for a in range(walls.shape[0]):
+        for b in range(count):
+            walls[a, b] = task.wall[a ^ b]
     moved = 0
     for y in range(first, last):
         for x in range(task.pad, etched.shape[1] - task.pad):
@@ -275,5 +288,5 @@ def sweep(task, first, last, weight, changed_too, sound):  # pragma: no cover - 
             if changed_too and task.wall.size and not seen:
                 seen = not own == etched[y, x - 1] == etched[y, x + 1] == etched[y - 1, x] == etched[y + 1, x]
             if seen or (not sound and offends(task, y, x)):
-                moved += _improve(task, y, x, weight, sound)
+                moved += _improve(task, walls, scratch, y, x, weight, sound)
     return moved
