@@ -40,8 +40,9 @@ def test_every_design_meets_every_process(spec: Path, tmp_path: Path, capsys: py
     rows = list(csv.DictReader(out.read_text().splitlines()))
     assert [(row["design"], row["process"]) for row in rows] == [(one.design, one.process) for one in found]
     assert len(found) == 2 * len(compare_robust.DESIGNS)
-    # A process of half the overlay does less to every plate; the last design was not made for the loss that judges it.
-    assert found[-1].design == "ring:disc"
-    for coarse, fine in zip(found[:-2:2], found[1:-2:2], strict=True):
+    # A process of half the overlay does less to every plate; some designs were not made for the loss that judges them.
+    alike = [one for one in found if one.design not in compare_robust.RINGS]
+    assert len(alike) == len(found) - 4
+    for coarse, fine in zip(alike[::2], alike[1::2], strict=True):
         assert abs(fine.mean_loss - fine.drawn_loss) < abs(coarse.mean_loss - coarse.drawn_loss)
     assert "written to" in capsys.readouterr().out
