@@ -2,7 +2,7 @@
 
 The DOE sits on a thin lens in the aperture plane (paper §3.1). For a sensor at the focal distance the lens cancels the
 quadratic term of Fresnel propagation and only the source's own path differences and the DOE remain (eq. 7); a sensor
-out of focus, or one without a lens, leaves a quadratic remainder, which is added here.
+out of focus, or one without a lens, leaves a quadratic remainder (`Camera.curvature_per_m`).
 """
 
 import math

@@ -89,47 +89,6 @@ def broken(task, y0, x0, y1, x1):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _is_short(task, y, x, dy, dx, first, last):  # pragma: no cover - compiled
-    # Whether `_deficit` is anything but 0.
-    etched = task.etched
-    for start in range(first, last + 1):
-        here = np.int64(etched[y + start * dy, x + start * dx])
-        begun = here ^ np.int64(etched[y + (start - 1) * dy, x + (start - 1) * dx])
-        line, space = begun & here, begun & ~here
-        before = here
-        for length in range(1, max(task.line, task.space)):
-            if not (line | space):
-                break
-            after = np.int64(etched[y + (start + length) * dy, x + (start + length) * dx])
-            ended = before ^ after
-            before = after
-            if (length < task.line and line & ended) or (length < task.space and space & ended):
-                return True
-            line &= ~ended
-            space &= ~ended
-    return False
-
-
-@njit(cache=True, nogil=True)
-def _breaks(task, y0, x0, y1, x1):  # pragma: no cover - compiled
-    # Whether `broken` is anything but 0: most moves break something that is found at once.
-    etched, reach = task.etched, max(task.line, task.space)
-    for y in range(y0 - 1, y1):
-        for x in range(x0 - 1, x1):
-            a, b, c, d = etched[y, x], etched[y, x + 1], etched[y + 1, x], etched[y + 1, x + 1]
-            if (a ^ b) & (c ^ d) & (a ^ c):
-                return True
-    if reach > 1:
-        for y in range(y0, y1):
-            if _is_short(task, y, x0, 0, 1, -reach, x1 - x0):
-                return True
-        for x in range(x0, x1):
-            if _is_short(task, y0, x, 1, 0, -reach, y1 - y0):
-                return True
-    return False
-
-
-@njit(cache=True, nogil=True)
 def offends(task, y, x):  # pragma: no cover - compiled
     """Whether a pixel itself lies in a short run or at a kissing corner."""
     if _kissing(task.etched, y, x, y + 1, x + 1):
@@ -246,10 +205,7 @@ def _improve(task, walls, scratch, y, x, weight, sound):  # pragma: no cover - c
                             kept[v - y0, u - x0] = etched[v, u]
                         etched[v, u] = depths[i]
                 written = True
-                if not sound:
-                    change += weight * broken(task, y0, x0, y1, x1)
-                elif _breaks(task, y0, x0, y1, x1):
-                    continue
+                change += weight * broken(task, y0, x0, y1, x1)
             if change < best:
                 best, best_depth = change, depths[i]
                 best_y, best_x, best_high, best_wide = y0, x0, high, wide
