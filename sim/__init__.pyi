@@ -40,6 +40,7 @@ from .psf_bank import PsfBank as PsfBank
 from .psf_bank import psf as psf
 from .rigorous import RowComparison as RowComparison
 from .rigorous import compare_row as compare_row
+from .rigorous import edge_dipoles as edge_dipoles
 from .rigorous import edge_widths as edge_widths
 from .rigorous.edge_optic import EdgeOptic as EdgeOptic
 from .rigorous.edge_optic import with_edges as with_edges

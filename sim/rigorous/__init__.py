@@ -3,8 +3,8 @@
 rows          coupled waves of a row that repeats
 crossed       Fourier modes of a square that repeats along both axes (fmmax)
 mirrored      one layer with a mirror, and the gradient of its orders
-edge_widths   what the wall between two heights adds to a thin element
-width_tables  those widths by height, shipped or computed once
+edge_widths   what the wall between two heights adds to a thin element: a line of light and a dipole
+width_tables  the same by height, shipped or computed once
 walls         the light of upright walls, with its gradient
 edge_optic    a DOE with that light: `with_edges`
 comparison    a row as a thin element, with edges and by Maxwell's equations
@@ -24,7 +24,7 @@ from sim.rigorous.certificate import (
 )
 from sim.rigorous.comparison import RowComparison, compare_row, thin_amplitudes
 from sim.rigorous.crossed import CrossedOrders, crossed_orders
-from sim.rigorous.edge_widths import edge_widths
+from sim.rigorous.edge_widths import edge_dipoles, edge_widths
 from sim.rigorous.mirrored import MirroredLayer
 from sim.rigorous.pieces import PieceComparison, compare_piece, thin_piece_amplitudes
 from sim.rigorous.rows import Orders, Slab, orders_of, row_slabs
@@ -49,6 +49,7 @@ __all__ = [
     "crossed_orders",
     "cut_pieces",
     "cut_rows",
+    "edge_dipoles",
     "edge_widths",
     "orders_of",
     "row_slabs",

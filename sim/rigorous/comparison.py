@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from sim.rigorous.edge_widths import edge_widths
+from sim.rigorous.edge_widths import light_of_walls
 from sim.rigorous.rows import POLARISATIONS, Polarisation, orders_of, row_slabs
 
 
@@ -61,13 +61,12 @@ def thin_amplitudes(
     light = np.exp(1j * waves * (index * height_m + top - height_m))
     amplitude = np.exp(-2j * np.pi * np.outer(number, middles)) @ light / cells * np.sinc(number / cells)
     if polarisation is not None:
-        last = np.roll(height_m, 1)
-        low, high = np.minimum(height_m, last), np.maximum(height_m, last)
-        walls, which = np.unique(np.round(high - low, 13), return_inverse=True)
-        width = edge_widths(tuple(walls.tolist()), wavelength_m, index, polarisation)[which]
-        lines = width * np.exp(1j * waves * (index * low + top - high))
+        walls = light_of_walls(
+            np.roll(height_m, 1), height_m, wavelength_m, index, polarisation, plane_m=float(height_m.mean()), top_m=top
+        )
         places = middles - 0.5 / cells
-        amplitude = amplitude + np.exp(-2j * np.pi * np.outer(number, places)) @ lines / (cells * cell_m)
+        lit = np.exp(-2j * np.pi * np.outer(number, places)) @ np.stack(walls, 1) / (cells * cell_m)
+        amplitude = amplitude + lit[:, 0] + 2j * np.pi * number / (cells * cell_m) * lit[:, 1]
     return number, amplitude
 
 

@@ -33,13 +33,14 @@ from sim.material import refractive_index
 from sim.optic import HeightOptic, ViewedOptic
 from sim.propagation.oblique import oblique_waves
 from sim.rigorous.walls import Walls, light_of_cells_and_walls
-from sim.rigorous.width_tables import highest_wall, two_waves, width_series
+from sim.rigorous.width_tables import edge_table, highest_wall, two_waves
 from sim.source import SeparableSource, SourceMap, View
 from sim.tracing import is_traced
 
 # Root mean square error of a line's far field that is good enough, and the largest that is borne before cells are
 # split; lines are about a tenth of the light.
 _GOOD, _WORST, _MOST_TAPS = 0.003, 0.03, 10
+_GOOD_DIPOLE = 0.08  # of dipoles, over their own
 _SHARES = 33  # of the way from the axis to the rim, for which weights are fitted
 
 
@@ -139,11 +140,13 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
         wavelength = view.wavelength_m
         index = refractive_index(camera.material, wavelength)
         highest = highest_wall(two_waves(wavelength, index) if is_traced(height) else float(jnp.ptp(height)))
-        taps, _ = line_weights(*oblique_waves(camera, wavelength, (view.nearest_m, view.farthest_m)), camera.opening)
+        waves = oblique_waves(camera, wavelength, (view.nearest_m, view.farthest_m))
+        taps = line_weights(*waves, camera.opening)[0], dipole_weights(*waves, camera.opening)
         walls = []
         for axis in ("y", "x"):
-            series = width_series(highest, wavelength, index, camera.polarisation, axis)
-            walls.append(Walls.of(series, highest, _at_borders(taps, camera, axis), camera.grid.pitch_m))
+            table = edge_table(highest, wavelength, index, camera.polarisation, axis)
+            own = _at_borders(taps[0], camera, axis), _at_borders(taps[1], camera, axis)
+            walls.append(Walls.of(table, highest, index / wavelength, own, camera.grid.pitch_m))
         found.append(light_of_cells_and_walls(height, camera.waves_per_metre(wavelength), *walls))
     coverage = jnp.asarray(open_cells(camera.grid, camera.opening))
     return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), tuple(views), wavelengths, depths)
@@ -202,21 +205,52 @@ def line_weights(
         an error of 0.3 %, ten on either side at most. Real ones for distant sources.
     """
     share = np.linspace(0, 1, _SHARES)
-    chord = _lengths_at(share, aperture)
-    chord = chord / chord.sum()
     waves = np.linspace(-seen - share * high, seen - share * low, 300)  # [wave, node]
     weights, error = np.zeros((_SHARES, 2), complex), np.inf
     for reach in range(1, _MOST_TAPS + 1):
-        places = np.arange(-reach, reach) + 0.5
-        field = np.exp(-2j * np.pi * waves.T[:, :, None] * places) * np.sinc(waves.T)[:, :, None]
-        axis = np.full((_SHARES, 1, 2 * reach), 1e3)  # as good as exact
-        matrix, wanted = np.concatenate([field, axis], 1), np.append(np.ones(300), 1e3)
-        weights = (np.linalg.pinv(matrix) @ wanted[:, None])[..., 0]
-        missed = np.abs((field @ weights[:, :, None])[..., 0] - 1) ** 2
-        error = float(np.sqrt((missed.mean(1) * chord).sum()))
+        weights, error = _fitted(waves.T, np.ones_like(waves.T), reach, np.ones(_SHARES), aperture)
         if error <= _GOOD:
             break
     return (np.real(weights) if low == high == 0 else weights), error
+
+
+@lru_cache(maxsize=64)
+def dipole_weights(seen: float, low: float, high: float, aperture: Aperture) -> Inexact[np.ndarray, "node tap"]:
+    """Weights on the cells to either side of a wall whose far field is that of its dipole.
+
+    Arguments as of `line_weights`. The far field is 2 pi i times the sum of the wave number of light to a pixel and
+    that of the light on the cell: where that is oblique, what stands higher is seen to the side. Dipoles are a fiftieth
+    of the light, and a tenth of them may be missed.
+    """
+    share = np.linspace(0, 1, _SHARES)
+    waves = np.linspace(-seen - share * high, seen - share * low, 300)
+    onto = share * (low + high) / 2
+    wanted, weights = 2j * np.pi * (waves + 2 * onto).T, np.zeros((_SHARES, 2), complex)
+    scale = np.sqrt(np.mean(np.abs(wanted) ** 2))
+    for reach in range(1, _MOST_TAPS + 1):
+        weights, error = _fitted(waves.T, wanted, reach, 4j * np.pi * onto, aperture)
+        if error <= _GOOD_DIPOLE * scale:
+            break
+    return np.real(weights) if low == high == 0 else weights
+
+
+def _fitted(
+    waves: Float[np.ndarray, "node wave"],
+    wanted: Inexact[np.ndarray, "node wave"],
+    reach: int,
+    on_axis: Inexact[np.ndarray, " node"],
+    aperture: Aperture,
+) -> tuple[Complex[np.ndarray, "node tap"], float]:
+    """Weights on `reach` cells to either side for a far field, and their error, the root mean square over all lines."""
+    places = np.arange(-reach, reach) + 0.5
+    field = np.exp(-2j * np.pi * waves[:, :, None] * places) * np.sinc(waves)[:, :, None]
+    axis = np.full((len(waves), 1, 2 * reach), 1e3)  # as good as exact
+    matrix = np.concatenate([field, axis], 1)
+    aim = np.concatenate([wanted, 1e3 * on_axis[:, None]], 1)
+    weights = (np.linalg.pinv(matrix) @ aim[:, :, None])[..., 0]
+    missed = np.abs((field @ weights[:, :, None])[..., 0] - wanted) ** 2
+    lengths = _lengths_at(np.linspace(0, 1, len(waves)), aperture)
+    return weights, float(np.sqrt(missed.mean(1) @ lengths / lengths.sum()))
 
 
 def _lengths_at(share: Float[np.ndarray, " node"], aperture: Aperture) -> Float[np.ndarray, " node"]:

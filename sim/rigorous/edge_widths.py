@@ -8,14 +8,24 @@ between two heights adds a line of light to the transmission exp(i k (n h + H - 
 with a complex width w of a few nanometres to a third of a micrometre. It is taken from one isolated pair of walls: a
 ridge as high as the wall and half as wide as its period, of which the rigorous 0th order, over what a bare face lets
 through, differs from the thin element's by 2 w / period.
+
+That line of light does not leave from the wall's foot. A step spreads as it goes down through the glass under it, and
+more the higher it stands: h of glass turn a wave number q by exp(-i q² h / (2 k n)). To first order that adds a pair of
+lines of opposite sign, a dipole, to every wall, p delta'(x - x_wall), where
+
+    p = i / (2 k n) (h_middle - h_plane) (t_behind - t_before) + the wall's own
+
+with h_middle halfway up the wall, h_plane any plane that all walls share (it is where the light is told, and changes no
+intensity), and t the light of the glass on either side. The wall's own part is half as strong; it comes from the odd
+orders of the same ridge.
 """
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Inexact
 from numpy.polynomial.chebyshev import chebvander
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, gmres
@@ -23,10 +33,22 @@ from scipy.sparse.linalg import LinearOperator, gmres
 from sim.rigorous.rows import Polarisation
 
 _PERIOD, _WAVES = 48.0, 3.0  # period in wavelengths; orders to either side over those that travel in glass
+_BAND = 0.17  # sine of the highest angle of light, in air, that dipoles are fitted to
 _FEWEST_TERMS, _MORE_TERMS, _GOOD_M = 12, 4, 2e-9
 
 
-@lru_cache(maxsize=256)
+class WallLight(NamedTuple):
+    """Light of walls, besides that of thin cells.
+
+    Attributes:
+        line_m: amplitude of the line of light on every wall, metres.
+        dipole_m2: of the dipole: far fields are those of line_m + 2 pi i q dipole_m2 on the wall, q in waves per metre.
+    """
+
+    line_m: Complex[np.ndarray, "*walls"]
+    dipole_m2: Complex[np.ndarray, "*walls"]
+
+
 def edge_widths(
     heights_m: tuple[float, ...],
     wavelength_m: float,
@@ -49,6 +71,72 @@ def edge_widths(
     Returns:
         widths for light exp(i k z - i omega t); their complex conjugates for the other sign.
     """
+    return _ridge_orders(heights_m, wavelength_m, index, polarisation, period, waves)[:, 0] * period * wavelength_m / 2
+
+
+def edge_dipoles(
+    heights_m: tuple[float, ...],
+    wavelength_m: float,
+    index: float,
+    polarisation: Polarisation,
+    *,
+    period: float = _PERIOD,
+    waves: float = _WAVES,
+) -> Complex[np.ndarray, " height"]:
+    """Dipoles, square metres, of walls that rise along the axis, told at the plane of their foot.
+
+    Arguments and sign as of `edge_widths`. They include the half of a wall's height that its middle is above its foot,
+    and are those that fit light up to 10 degrees in air best.
+    """
+    found = _ridge_orders(heights_m, wavelength_m, index, polarisation, period, waves)
+    order = np.arange(1, int(_BAND * period) + 1, 2)
+    sine, turn = order / period, 2j * np.where(order % 4 == 1, 1, -1)
+    odd = found[:, order] / turn * period * wavelength_m
+    return (odd @ sine) / (sine @ sine) * wavelength_m / (2j * np.pi)
+
+
+def light_of_walls(
+    before_m: Float[np.ndarray, "*walls"],
+    behind_m: Float[np.ndarray, "*walls"],
+    wavelength_m: float,
+    index: float,
+    polarisation: Polarisation,
+    *,
+    plane_m: float,
+    top_m: float,
+) -> WallLight:
+    """Light of walls between the cells before and behind them along an axis, over that through a bare face.
+
+    Args:
+        before_m: height of the cells before the walls.
+        behind_m: of those behind.
+        wavelength_m: vacuum wavelength.
+        index: refractive index of the glass.
+        polarisation: "TE" or "TM".
+        plane_m: height at which light is told: the middle of the relief, say.
+        top_m: height at which light enters.
+    """
+    waves = 2 * np.pi / wavelength_m
+    low, high = np.minimum(before_m, behind_m), np.maximum(before_m, behind_m)
+    walls, which = np.unique(np.round(high - low, 13), return_inverse=True)
+    given = tuple(walls.tolist()), wavelength_m, index, polarisation
+    line, dipole = (solved(*given)[which].reshape(low.shape) for solved in (edge_widths, edge_dipoles))
+    lower = np.exp(1j * waves * (index * low + top_m - high))
+    light = [np.exp(1j * waves * (index * height + top_m - height)) for height in (before_m, behind_m)]
+    foot = 1j / (2 * waves * index) * (low - plane_m) * (light[1] - light[0])
+    return WallLight(line * lower, foot + np.sign(behind_m - before_m) * dipole * lower)
+
+
+@lru_cache(maxsize=256)
+def _ridge_orders(
+    heights_m: tuple[float, ...],
+    wavelength_m: float,
+    index: float,
+    polarisation: Polarisation,
+    period: float,
+    waves: float,
+) -> Complex[np.ndarray, "height order"]:
+    """Orders 0 ... of ridges about the origin, less those of a thin element, over what a bare face lets through."""
     size = int(np.ceil(waves * period * index)) + 1
     along_x, te = np.arange(size) / period, polarisation == "TE"
     cosines = _even(index**2, 1.0, size)
@@ -65,6 +153,9 @@ def edge_widths(
         other = inverse @ modes
     decay = np.conj(np.emath.sqrt(square + 0j))  # -i kz
     before, behind = (np.conj(np.emath.sqrt(along_x**2 - n**2 + 0j)) for n in (1.0, index))
+    # Orders that the band holds: their power is that of their amplitude times this.
+    kept = int(_BAND * period) + 1
+    oblique = np.sqrt(np.abs(behind[:kept]) / index) / np.where(np.arange(kept) == 0, 1.0, np.sqrt(2))
     behind = behind if te else behind / index**2
     up, down = np.linalg.inv(modes), np.linalg.solve(other * decay, np.diag(behind))
     inverse_sum = np.linalg.inv((up + down) / 2)
@@ -79,62 +170,63 @@ def edge_widths(
         waves_of_it = height / wavelength_m
         through = np.exp(-2 * np.pi * decay * waves_of_it)
         excited = _with_echoes(entered, lambda modes, t=through: turned @ (t * (returned @ (t * modes))))
-        amplitude = inverse_sum[0] @ (through * excited)
-        thin = (np.exp(2j * np.pi * index * waves_of_it) + np.exp(2j * np.pi * waves_of_it)) / 2
-        found.append((amplitude / face - thin) * period * wavelength_m / 2)
+        amplitude = inverse_sum[:kept] @ (through * excited) * oblique / face
+        ridge, groove = np.exp(2j * np.pi * index * waves_of_it), np.exp(2j * np.pi * waves_of_it)
+        found.append(amplitude - _coefficients(ridge, groove, kept))
     return np.array(found)
 
 
-def relative_widths(
-    heights_m: Float[np.ndarray, " height"], wavelength_m: float, index: float, polarisation: str, axis: str
-) -> Complex[np.ndarray, " height"]:
-    """Light of walls across an axis ("x" or "y") over that of the glass on their lower side, metres.
+class EdgeTable(NamedTuple):
+    """Light of walls of all heights up to a highest, over that of the glass on their lower side.
+
+    Attributes:
+        width_m: the width of a wall of height h is h / highest times the series (`series_at`) at 2 h / highest - 1: its
+            coefficients of Chebyshev polynomials, metres.
+        dipole: a, b, c, d of a dipole h (a + b h + (c + d h) t) of a rising wall, told at its foot, where t is the
+            light of the higher side over that of the lower: a and c in metres, b and d without unit.
+    """
+
+    width_m: Complex[np.ndarray, " term"]
+    dipole: Complex[np.ndarray, "4"]
+
+
+def computed_table(highest_m: float, wavelength_m: float, index: float, polarisation: str, axis: str) -> EdgeTable:
+    """Light of walls of all heights up to a highest, from rigorous solutions.
+
+    As many terms of the series as leave 2 nm; up to two waves in glass, twenty do. Light that goes up and down between
+    the heights, a nanometre every quarter of a wave, takes many more. The four numbers of the dipoles leave 1 % of
+    them, 3 % where the highest wall is two waves.
 
     Args:
-        heights_m: of the walls.
+        highest_m: metres, positive.
         wavelength_m: vacuum wavelength.
         index: refractive index of the glass.
         polarisation: "x" or "y", the axis along which the electric field lies, or "unpolarised": the mean of both.
         axis: across which the walls stand.
     """
     ways: dict[str, tuple[Polarisation, ...]] = {"unpolarised": ("TE", "TM"), axis: ("TM",)}
-    heights = tuple(np.asarray(heights_m, float).tolist())
-    widths = [edge_widths(heights, wavelength_m, index, way) for way in ways.get(polarisation, ("TE",))]
-    # The lower side's light is delayed by its own glass; all of the wall's height is air to it.
-    return np.mean(widths, axis=0) * np.exp(-2j * np.pi * heights_m / wavelength_m)
-
-
-def computed_series(
-    highest_m: float, wavelength_m: float, index: float, polarisation: str, axis: str
-) -> Complex[np.ndarray, " term"]:
-    """`relative_widths` of all heights up to a highest as a short series.
-
-    The width of a wall of height h is h / highest times the series (`series_at`) at 2 h / highest - 1. As many terms as
-    leave 2 nm; up to two waves in glass, twenty do. Light that goes up and down between the heights, a nanometre
-    every quarter of a wave, takes many more.
-
-    Args:
-        highest_m: metres, positive.
-        wavelength_m: vacuum wavelength.
-        index: refractive index of the glass.
-        polarisation: of `relative_widths`.
-        axis: across which the walls stand.
-
-    Returns:
-        coefficients of Chebyshev polynomials, metres.
-    """
     terms = _FEWEST_TERMS
     while True:
         # Even steps, and ever smaller ones towards both ends, where polynomials stray.
         ends = (1 - np.cos(np.linspace(0, np.pi, 3 * terms))) / 2
-        height = highest_m * np.union1d(np.linspace(0, 1, 4 * terms), ends)
-        wanted = relative_widths(height, wavelength_m, index, polarisation, axis)
-        share = height / highest_m
+        share = np.union1d(np.linspace(0, 1, 4 * terms), ends)
+        height = highest_m * share
+        solved = tuple(height.tolist()), wavelength_m, index
+        # The lower side's light is delayed by its own glass; all of the wall's height is air to it.
+        air = np.exp(-2j * np.pi * height / wavelength_m)
+        width, dipole = (
+            air * np.mean([of(*solved, way) for way in ways.get(polarisation, ("TE",))], axis=0)
+            for of in (edge_widths, edge_dipoles)
+        )
         matrix = share[:, None] * chebvander(2 * share - 1, terms - 1)
-        series = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
-        if np.abs(matrix @ series - wanted).max() <= _GOOD_M:
-            return series
+        series = np.linalg.lstsq(matrix, width, rcond=None)[0]
+        if np.abs(matrix @ series - width).max() <= _GOOD_M:
+            break
         terms += _MORE_TERMS
+    higher = np.exp(2j * np.pi * (index - 1) * height / wavelength_m)
+    parts = np.stack([share, share**2, share * higher, share**2 * higher], 1)
+    units = np.array([highest_m, highest_m**2] * 2)
+    return EdgeTable(series, np.linalg.lstsq(parts, dipole, rcond=None)[0] / units)
 
 
 def series_at(series: Any, place: Any) -> Any:
@@ -158,7 +250,7 @@ def _with_echoes(
     return excited
 
 
-def _coefficients(ridge: float, groove: float, count: int) -> Float[np.ndarray, " order"]:
+def _coefficients(ridge: complex, groove: complex, count: int) -> Inexact[np.ndarray, " order"]:
     """Fourier coefficients 0 ... of a ridge that fills the middle half of a period about the origin."""
     return np.where(np.arange(count) == 0, groove, 0.0) + (ridge - groove) * np.sinc(np.arange(count) / 2) / 2
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Shaped
 
 from sim.rigorous.crossed import CROSSED_POLARISATIONS, crossed_orders
-from sim.rigorous.edge_widths import edge_widths
+from sim.rigorous.edge_widths import light_of_walls
 from sim.rigorous.rows import Polarisation
 
 
@@ -69,10 +69,16 @@ def thin_piece_amplitudes(
     amplitude = cells[0] @ light @ cells[1].T
     if polarisation is not None:
         across: dict[str, tuple[Polarisation, Polarisation]] = {"x": ("TE", "TM"), "y": ("TM", "TE")}
-        over_y, over_x = (
-            _lines(height_m, axis, waves, index, way) / cell_m for axis, way in enumerate(across[polarisation])
-        )
-        amplitude = amplitude + borders[0] @ over_y @ cells[1].T + cells[0] @ over_x @ borders[1].T
+        for axis, way in enumerate(across[polarisation]):
+            plane_m = float(height_m.mean())
+            before = np.roll(height_m, 1, axis)
+            walls = light_of_walls(before, height_m, wavelength_m, index, way, plane_m=plane_m, top_m=top)
+            count = height_m.shape[axis]
+            number = np.arange(-(count // 2), count // 2 + 1)
+            of_lines, along = borders[axis] / cell_m, cells[1 - axis]
+            of_dipoles = (2j * np.pi * number / (count * cell_m))[:, None] * of_lines
+            for light, transform in zip(walls, (of_lines, of_dipoles), strict=True):
+                amplitude = amplitude + (transform @ light @ along.T if axis == 0 else along @ light @ transform.T)
     return amplitude
 
 
@@ -81,17 +87,6 @@ def _transforms(cells: int) -> tuple[Complex[np.ndarray, "order cell"], Complex[
     number, places = np.arange(-(cells // 2), cells // 2 + 1), np.arange(cells) / cells
     borders = np.exp(-2j * np.pi * np.outer(number, places)) / cells
     return borders * (np.exp(-1j * np.pi * number / cells) * np.sinc(number / cells))[:, None], borders
-
-
-def _lines(
-    height_m: Float[np.ndarray, "y x"], axis: int, waves: float, index: float, way: Polarisation
-) -> Complex[np.ndarray, "y x"]:
-    """Light of the walls between every cell and the one before it along an axis, metres times that of a cell."""
-    last = np.roll(height_m, 1, axis)
-    low, high = np.minimum(height_m, last), np.maximum(height_m, last)
-    walls, which = np.unique(np.round(high - low, 13), return_inverse=True)
-    width = edge_widths(tuple(walls.tolist()), 2 * np.pi / waves, index, way)[which.reshape(low.shape)]
-    return width * np.exp(1j * waves * (index * low + float(np.max(height_m)) - high))
 
 
 def compare_piece(

@@ -1,4 +1,4 @@
-"""Tables of edge widths: those of the stock process lie beside this file, all others are computed once and kept.
+"""Tables of the light of walls: those of the stock process lie beside this file, all others are computed once and kept.
 
 The stock process is fused silica with 16 levels of 75 nm under the lines of the examples. A table that fits no request
 exactly is not used: material, wavelength, highest wall and polarisation are its key. `python -m
@@ -12,11 +12,10 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex
 
 from fab.files import write_atomic
 from sim.material import refractive_index
-from sim.rigorous.edge_widths import computed_series
+from sim.rigorous.edge_widths import EdgeTable, computed_table
 
 _FILE = Path(__file__).with_name("stock_widths.json")
 HEADROOM = 1.25  # of the highest wall as fabricated over that as drawn
@@ -25,7 +24,7 @@ _STOCK_LINES_M, _STOCK_ETCHES_M = (656e-9, 589e-9, 532e-9, 486e-9), (75e-9, 150e
 
 
 class WidthKey(NamedTuple):
-    """Walls and light of one table of edge widths.
+    """Walls and light of one table.
 
     Attributes:
         highest_m: height of the highest wall.
@@ -39,10 +38,10 @@ class WidthKey(NamedTuple):
     glass: float
     way: str
 
-    def computed(self) -> Complex[np.ndarray, " term"]:
+    def computed(self) -> EdgeTable:
         """The table, from rigorous solutions."""
         polarisation = {"across": "x", "along": "y"}.get(self.way, self.way)
-        return computed_series(self.highest_m, self.wavelength_m, self.glass, polarisation, "x")
+        return computed_table(self.highest_m, self.wavelength_m, self.glass, polarisation, "x")
 
 
 def highest_wall(range_m: float) -> float:
@@ -56,10 +55,8 @@ def two_waves(wavelength_m: float, index: float) -> float:
 
 
 @lru_cache(maxsize=64)
-def width_series(
-    highest_m: float, wavelength_m: float, index: float, polarisation: str, axis: str
-) -> Complex[np.ndarray, " term"]:
-    """Widths of all walls up to a highest (`sim.rigorous.edge_widths.computed_series`), shipped or computed once.
+def edge_table(highest_m: float, wavelength_m: float, index: float, polarisation: str, axis: str) -> EdgeTable:
+    """Light of all walls up to a highest (`sim.rigorous.edge_widths.computed_table`), shipped or computed once.
 
     Args:
         highest_m: metres, positive.
@@ -67,9 +64,6 @@ def width_series(
         index: refractive index of the glass.
         polarisation: "x", "y" or "unpolarised".
         axis: "x" or "y", across which the walls stand.
-
-    Returns:
-        coefficients of Chebyshev polynomials, metres.
     """
     way = polarisation if polarisation == "unpolarised" else ("across" if polarisation == axis else "along")
     key = WidthKey(highest_m, wavelength_m, index, way)
@@ -78,11 +72,11 @@ def width_series(
 
 
 @cache
-def shipped_tables() -> MappingProxyType[WidthKey, Complex[np.ndarray, " term"]]:
+def shipped_tables() -> MappingProxyType[WidthKey, EdgeTable]:
     """Tables of the stock process, as they are shipped."""
     return MappingProxyType(
         {
-            WidthKey(*one["key"]): np.array(one["real_m"]) + 1j * np.array(one["imag_m"])
+            WidthKey(*one["key"]): EdgeTable(*(np.array([1, 1j]) @ one[name] for name in EdgeTable._fields))
             for one in json.loads(_FILE.read_text())
         }
     )
@@ -102,6 +96,6 @@ def stock_keys() -> list[WidthKey]:
 if __name__ == "__main__":
     found = []
     for key in stock_keys():
-        table = key.computed()
-        found.append({"key": key, "real_m": np.real(table).tolist(), "imag_m": np.imag(table).tolist()})
+        table = {name: [np.real(of).tolist(), np.imag(of).tolist()] for name, of in key.computed()._asdict().items()}
+        found.append({"key": key} | table)
     write_atomic(_FILE, (json.dumps(found, indent=1) + "\n").encode())

@@ -23,6 +23,7 @@ DEGREE = 3  # of the highest moments
 # Moments kept: degree along y and along x.
 DEGREES = tuple((y, x) for y in range(DEGREE + 1) for x in range(DEGREE + 1 - y))
 LINE_DEGREE = 2  # the same of lines along borders
+DIPOLE = LINE_DEGREE + 1  # of a line, after its moments across it: its dipole
 REACH = 20  # cells to either side of a moment's own
 _RIDGE = 1e-8  # keeps weights small where the band leaves them free
 
@@ -121,17 +122,19 @@ def moment_weights(
 ) -> Complex[np.ndarray, "band kind tap"]:
     """Weights on the cells -20 ... 20 from a moment's own whose far field is that of the moment.
 
-    The first three kinds are moments of degree 1, 2 and 3 of a cell, the others those of degree 0, 1 and 2 of a line
-    about the lower border of its cell, sum of light times place^q with places in cells.
+    The first three kinds are moments of degree 1, 2 and 3 of a cell, the next those of degree 0, 1 and 2 of a line
+    about the lower border of its cell, sum of light times place^q with places in cells, and the last is a dipole there.
 
     A cell's far field is sinc(u). The sum of weights times exp(-2 pi i u k) sinc(u) is fitted by least squares to
-    (2q+1) (-i)^q j_q(pi u), the far field of moment q, and to exp(i pi u) (-2 pi i u)^q / q!, that of a line's moment,
-    for wave numbers u from `low` to `high`, waves per cell: those of light to a pixel less that of the light on the
-    cell. Any band narrower than 1 can be fitted, wherever it lies. `slope` is how much more obliquely each cell is lit
-    than the one before, waves per cell. Near the border of the grid only the cells `within` some places have weights.
+    (2q+1) (-i)^q j_q(pi u), the far field of moment q, to exp(i pi u) (-2 pi i u)^q / q!, that of a line's moment, and
+    to 2 pi i (u + 2 v) exp(i pi u), that of a dipole (`sim.rigorous.edge_optic.dipole_weights`), for wave numbers u from
+    `low` to `high`, waves per cell: those of light to a pixel less that of the light on the cell, v. Any band narrower
+    than 1 can be fitted, wherever it lies. `slope` is how much more obliquely each cell is lit than the one before,
+    waves per cell. Near the border of the grid only the cells `within` some places have weights.
 
-    The weights of all kinds but a line's light itself, whose weights sum to 1, have no effect on the axis, so that they
-    leave the mean of a plate alone; they are real for a band that is symmetric about it.
+    The weights of all kinds but a line's light itself, whose weights sum to 1, and of dipoles that are lit obliquely,
+    have no effect on the axis, so that they leave the mean of a plate alone; they are real for a band that is symmetric
+    about it.
     """
     waves = (low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 200))[:, :, None]  # [band, node, place]
     places = np.arange(within[0], within[1] + 1)
@@ -139,11 +142,14 @@ def moment_weights(
     degrees, powers = np.arange(1, DEGREE + 1), np.arange(LINE_DEGREE + 1)
     cells = (2 * degrees + 1) * (-1j) ** degrees * spherical_jn(degrees, np.pi * waves)
     lines = np.exp(1j * np.pi * waves) * (-2j * np.pi * waves) ** powers / factorial(powers)
-    wanted = np.concatenate([cells, lines], 2)
-    on_axis = np.where(np.arange(wanted.shape[2]) == DEGREE, 1.0, 0.0)
+    onto = -(low + high)[:, None, None]  # twice the wave number of the light on the cell
+    dipoles = 2j * np.pi * (waves + onto) * np.exp(1j * np.pi * waves)
+    wanted = np.concatenate([cells, lines, dipoles], 2)
+    on_axis = np.zeros((len(low), 1, wanted.shape[2]), complex)
+    on_axis[..., DEGREE], on_axis[..., DEGREE + DIPOLE] = 1.0, 2j * np.pi * onto[..., 0]
     turned = seen.conj().swapaxes(1, 2) / waves.shape[1]
     # As good as exact on the axis, and then exact.
     matrix = turned @ seen + 1e3 * np.ones((len(places), len(places))) + _RIDGE * np.eye(len(places))
     weights = np.linalg.solve(matrix, turned @ wanted + 1e3 * on_axis).swapaxes(1, 2)
-    weights = weights + ((on_axis - weights.sum(axis=2)) / len(places))[:, :, None]
+    weights = weights + ((on_axis[:, 0] - weights.sum(axis=2)) / len(places))[:, :, None]
     return np.pad(weights, ((0, 0), (0, 0), (REACH + within[0], REACH - within[1])))

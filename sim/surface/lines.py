@@ -10,7 +10,7 @@ height, the share exp(-(distance / 60 nm)²) is handed on to the next wall. Mask
 right to 2.7 % of the orders (root mean square), where a thin element misses 7 to 18 %.
 
 A line is described by its moments about the border, across it and along it, as a cell is by those of the cell
-(`sim.surface.cell`).
+(`sim.surface.cell`); its dipole by the first of these.
 """
 
 from functools import lru_cache
@@ -19,35 +19,50 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from sim.camera import Camera
 from sim.material import refractive_index
 from sim.rigorous.edge_widths import series_at
-from sim.rigorous.width_tables import width_series
-from sim.surface.cell import LINE_DEGREE
+from sim.rigorous.width_tables import edge_table
+from sim.surface.cell import DIPOLE, LINE_DEGREE
 from sim.surface.pieces import TILE, Pair, light_of
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 
-# Moments kept: degree along the line and across it.
-LINE_DEGREES = tuple((along, across) for along in range(LINE_DEGREE + 1) for across in range(LINE_DEGREE + 1 - along))
+# Moments kept: degree along the line and across it, and the dipole.
+_DEGREES = tuple((along, across) for along in range(LINE_DEGREE + 1) for across in range(LINE_DEGREE + 1 - along))
+LINE_KINDS = (*_DEGREES, (0, DIPOLE))
 _TOGETHER_M = 60e-9  # distance at which walls act together
 
 
+class WallNumbers(NamedTuple):
+    """Light of walls across y and across x over that of the lower side (`sim.rigorous.width_tables.edge_table`)."""
+
+    width: Float[np.ndarray, "axis part w term"]  # series, over the pitch
+    dipole: Float[np.ndarray, "axis part w 4"]  # over the pitch squared
+    foot: Float[np.ndarray, " w"]  # dipole per height of the foot and step of the light, over i and the pitch squared
+    highest_m: np.float32
+
+
 @lru_cache(maxsize=16)
-def wall_series(
-    camera: Camera, wavelengths_m: tuple[float, ...], highest_m: float
-) -> Float[np.ndarray, "axis part w term"]:
-    """Light of walls across y and across x over that of the lower side, over the pitch (`width_series`)."""
+def wall_numbers(camera: Camera, wavelengths_m: tuple[float, ...], highest_m: float) -> WallNumbers:
+    """Light of all walls up to a highest."""
+    index = [refractive_index(camera.material, wavelength) for wavelength in wavelengths_m]
     found = [
-        width_series(highest_m, wavelength, refractive_index(camera.material, wavelength), camera.polarisation, axis)
+        edge_table(highest_m, *of, camera.polarisation, axis)
         for axis in ("y", "x")
-        for wavelength in wavelengths_m
+        for of in zip(wavelengths_m, index, strict=True)
     ]
-    terms = max(map(len, found))
-    series = np.array([np.pad(one, (0, terms - len(one))) for one in found]) / camera.grid.pitch_m
-    series = series.reshape(2, len(wavelengths_m), terms)
-    return np.stack([series.real, series.imag], 1).astype(np.float32)
+    terms, pitch = max(len(one.width_m) for one in found), camera.grid.pitch_m
+    width = np.array([np.pad(one.width_m, (0, terms - len(one.width_m))) for one in found]) / pitch
+    dipole = np.array([one.dipole for one in found]) / pitch**2
+
+    def parts(values: Complex[np.ndarray, "n m"]) -> Float[np.ndarray, "axis part w m"]:
+        values = values.reshape(2, len(wavelengths_m), -1)
+        return np.stack([np.real(values), np.imag(values)], 1).astype(np.float32)
+
+    foot = np.array(wavelengths_m) / np.array(index) / (4 * np.pi * pitch**2)
+    return WallNumbers(parts(width), parts(dipole), foot.astype(np.float32), np.float32(highest_m))
 
 
 class _Wall(NamedTuple):
@@ -68,7 +83,7 @@ def line_moments(
     rates: Float[Array, " w"],
     plan: TilePlan,
 ) -> Float[Array, "axis kind 2 w cell"]:
-    """Moments of the lines at the lower borders of a tile's cells, across y and across x, for `LINE_DEGREES`.
+    """Moments of the lines at the lower borders of a tile's cells, across y and across x, for `LINE_KINDS`.
 
     Args:
         states: open share of every mask's pixels, with a halo.
@@ -82,7 +97,7 @@ def line_moments(
     pitch, whole = plan.grid.pitch_m, jnp.round(shift).astype(jnp.int32)
     place, bias = shift - whole, effective_bias(relief) / pitch
     assert relief.walls is not None
-    series, highest = relief.walls
+    numbers = relief.walls
 
     def across(axis: int) -> Array:
         def pixels(mask: Array) -> Array:
@@ -101,19 +116,26 @@ def line_moments(
         rise, along = -relief.depth_m[:, None] * opens * uniform, jnp.broadcast_to(place[:, 1 - axis, None], at.shape)
         walls = _sorted(at, rise, along)
 
-        def light(wall: _Wall) -> Array:
+        def light(wall: _Wall) -> tuple[Array, Array]:
+            """Line and dipole, `[2, w, cell]` each."""
             lower = wall.height_m - jnp.maximum(wall.rise_m, 0.0)
-            size = jnp.abs(wall.rise_m) / highest
-            terms = jnp.moveaxis(series[axis], -1, 0)[..., None]  # [term, part, w, 1]
+            height = jnp.abs(wall.rise_m)
+            size = height / numbers.highest_m
+            terms = jnp.moveaxis(numbers.width[axis], -1, 0)[..., None]  # [term, part, w, 1]
             own = Pair(*(series_at(terms, 2 * size - 1) * (size * plan.parts)))
-            return jnp.stack(Pair(*light_of(lower[None], rates)[0]).times(own))
+            low, high = (Pair(*light_of(at[None], rates)[0]) for at in (lower, lower + height))
+            a, b, c, d = jnp.moveaxis(numbers.dipole[axis], -1, 0)[..., None]  # [part, w, 1]
+            foot = numbers.foot[:, None] * (lower - relief.height_m / 2)  # the plane is halfway up the relief
+            near, far = height * (a + b * height), height * (c + d * height)
+            dipole = low.times(Pair(near[0], near[1] - foot)).plus(high.times(Pair(far[0], far[1] + foot)))
+            return jnp.stack(low.times(own)), jnp.stack(dipole) * (jnp.sign(wall.rise_m) * plan.parts**2)
 
         def moments(wall: _Wall, amount: Array | float) -> Array:
-            lit = light(wall) * amount
+            lit, dipole = (part * amount for part in light(wall))
             along, at = wall.along * plan.parts, wall.across * plan.parts
             # Of the Legendre polynomials over a wall that is displaced as a whole.
             displaced = (1.0, 2 * along, 6 * along**2)
-            return jnp.stack([lit * (displaced[a] * at**b) for a, b in LINE_DEGREES])
+            return jnp.stack([*(lit * (displaced[a] * at**b) for a, b in _DEGREES), dipole])
 
         def meet(last: tuple[_Wall, Array], next_wall: tuple[Array, ...]) -> tuple[tuple[_Wall, Array], None]:
             (wall, total), (at, rise, along) = last, next_wall
@@ -124,7 +146,7 @@ def line_moments(
             return (_Wall(*(jnp.where(stands, new, old) for new, old in zip(met, wall, strict=True))), total), None
 
         none = jnp.zeros_like(height)
-        empty = jnp.zeros((len(LINE_DEGREES), 2, len(rates), len(none)))
+        empty = jnp.zeros((len(LINE_KINDS), 2, len(rates), len(none)))
         (wall, total), _ = jax.lax.scan(meet, (_Wall(none, none, none, height), empty), walls)
         return total + moments(wall, 1.0)
 

@@ -24,7 +24,7 @@ from sim.propagation.pupil import DoeRows, SourceColumns
 from sim.rigorous.edge_optic import EdgeOptic, with_edges
 from sim.rigorous.width_tables import HEADROOM
 from sim.source import SourceMap, View
-from sim.surface.lines import wall_series
+from sim.surface.lines import wall_numbers
 from sim.surface.opening import Opening
 from sim.surface.pieces import TILE
 from sim.surface.relief import plan_of, relief_of, require_possible, view_weights
@@ -137,8 +137,7 @@ def as_fabricated(
         rough = cell_roughness(camera.grid, variation.roughness_m, variation.correlation_m, variation.seed)
     walls = None
     if camera.light == "edges":
-        highest = _highest_m(process, variation, traced)
-        walls = wall_series(camera, lines, highest), single(highest)
+        walls = wall_numbers(camera, lines, _highest_m(process, variation, traced))
     relief = relief_of(process, variation, rough, walls)
     packed = np.packbits(etched, axis=0, bitorder="little")[0]  # bit k for mask k
     left = np.ones(len(waves), np.float32)

@@ -49,7 +49,7 @@ class EtchParameters(NamedTuple):
     tilt: Array  # `[(y, x)]` depth share per metre
     rough_m: Array | None  # `[y, x]` height of the roughness, or None
     height_m: Array  # height of the blank surface above the deepest nominal floor
-    walls: tuple[Any, Any] | None = None  # their light (`sim.surface.lines.wall_series`), and the highest
+    walls: Any = None  # their light, `sim.surface.lines.WallNumbers`, or None
 
 
 class TilePlan(NamedTuple):
@@ -186,7 +186,7 @@ def relief_of(
     process: Process,
     variation: Variation,
     rough_m: Float[Array, "y x"] | None = None,
-    walls: tuple[Any, Any] | None = None,
+    walls: Any = None,
 ) -> EtchParameters:
     """The errors of one plate, the depths of its etches and the light of its walls as the numbers that tiles share."""
     masks, levels = process.masks, process.levels

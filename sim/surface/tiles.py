@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, UInt8
 
-from sim.surface.cell import DEGREE, DEGREES, LINE_DEGREE, REACH, axis_moments, cuts, plane_moments, whole_cell
+from sim.surface.cell import DEGREE, DEGREES, DIPOLE, LINE_DEGREE, REACH, axis_moments, cuts, plane_moments, whole_cell
 from sim.surface.edges import corners, walls
-from sim.surface.lines import LINE_DEGREES, line_moments
+from sim.surface.lines import LINE_KINDS, line_moments
 from sim.surface.opening import Opening, through_opening
 from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
@@ -208,8 +208,13 @@ def _tile_moments(
 
 def _kinds(most: int, along: int, plan: TilePlan) -> Int[np.ndarray, " kind"]:
     """Which kinds of moments across an axis are used: of cells to degree `most`, of lines to degree `along`."""
-    lines = along + 1 if plan.lines else 0
-    return np.array([*range(most), *range(DEGREE, DEGREE + lines)], int)
+    lines = [DEGREE + kind for kind in _line_kinds(along)] if plan.lines else []
+    return np.array([*range(most), *lines], int)
+
+
+def _line_kinds(along: int) -> list[int]:
+    """Moments across lines to a degree, with the dipole after all of them."""
+    return [*range(along + 1), *([DIPOLE] if along == LINE_DEGREE else [])]
 
 
 def _tile_rows(
@@ -241,9 +246,9 @@ def _tile_rows(
         for degree in range(DEGREE + 1):
             top = max(most - degree, 0)
             higher = [of[degree, x] for x in range(1, top + 1)]
-            higher += [across_x[degree, x][number] for x in range(LINE_DEGREE + 1 - degree) if plan.lines]
+            higher += [across_x[degree, x][number] for x in _line_kinds(LINE_DEGREE - degree) if plan.lines]
             rows.append(spread(of[degree, 0], higher, weights[:, _kinds(top, LINE_DEGREE - degree, plan)]))
-        for y in range(LINE_DEGREE + 1 if plan.lines else 0):
+        for y in _line_kinds(LINE_DEGREE) if plan.lines else []:
             higher = [across_y[x, y][number] for x in range(1, LINE_DEGREE + 1 - y)]
             rows.append(spread(across_y[0, y][number], higher, weights[:, : len(higher)]))
         return jnp.stack(rows)
@@ -270,7 +275,7 @@ def _line_values(
         between = np.zeros(plan.parts, np.float32)
         between[0] = 1
         found = jnp.moveaxis(jnp.kron(jnp.moveaxis(found, axis - 2, -1), between), -1, axis - 2)
-    return dict(zip(LINE_DEGREES, found, strict=False))
+    return dict(zip(LINE_KINDS, found, strict=False))
 
 
 def _strip_values(

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 from doedesign.design.design import Design
 from fab.process import Process, variation_of
 from sim.material import refractive_index
-from sim.rigorous.edge_widths import edge_widths
+from sim.rigorous.edge_widths import edge_dipoles, edge_widths
 from tests.physics.plate_raster import raster_height_m
 
 SAMPLES = 25  # per cell and axis: 74 nm in a cell of 1.85 um, so moved edges move by multiples of that
@@ -79,7 +79,7 @@ def foreign_light(
     open_ = square <= camera.aperture_m**2 / 4
     index, waves = refractive_index(camera.material, wavelength_m), 2 * np.pi / wavelength_m
     thin = np.exp(1j * waves * (index - 1) * height)
-    fields = _with_walls(thin, height, wavelength_m, index, step) if edges else [thin]
+    fields = _with_walls(thin, height, wavelength_m, index, step) if edges else [(thin, 0.0, 0.0)]
     scale, side = wavelength_m * camera.focal_length_m, camera.window + margin
     places, weights = _pixels(side, camera.fill, camera.pixel_m, camera.focal_length_m, askew, shift_px)
     reach = np.ceil(np.abs(places).max() / (_SPACING * scale / camera.aperture_m)) + _ROOM
@@ -90,7 +90,11 @@ def foreign_light(
         path = np.zeros_like(square) if np.isinf(depth) else square / (np.sqrt(square + depth**2) + depth)
         source = open_ * np.exp(2j * np.pi / wavelength_m * path)
         # The amplitude is that per unit of power on the clear aperture.
-        power = [np.abs(wave @ (field * source) @ wave.T / scale) ** 2 for field in fields]
+        oblique = 0.0 if np.isinf(depth) else 4j * np.pi * axis / (wavelength_m * depth)
+        lit = [
+            field + dipole_y * np.reshape(oblique, (-1, 1)) + dipole_x * oblique for field, dipole_y, dipole_x in fields
+        ]
+        power = [np.abs(wave @ (field * source) @ wave.T / scale) ** 2 for field in lit]
         intensity = np.mean(power, axis=0) / (np.pi * camera.aperture_m**2 / 4)
         spline = RectBivariateSpline(u, u, intensity, kx=5, ky=5)
         frames.append((spline.ev(places[0], places[1]) * weights).sum(axis=-1))
@@ -119,30 +123,41 @@ def _pixels(
 
 def _with_walls(
     thin: Complex[np.ndarray, "y x"], height: np.ndarray, wavelength_m: float, index: float, step: float
-) -> list[Complex[np.ndarray, "y x"]]:
-    """Transmission with the lines of light of all upright walls, for light polarised along y and along x."""
+) -> list[tuple[Complex[np.ndarray, "y x"], ...]]:
+    """Transmission with the lines and dipoles of all upright walls, for light polarised along y and along x.
+
+    After it come the dipoles across y and across x as lines of light, which count where walls are lit from a side.
+    """
     waves, across = 2 * np.pi / wavelength_m, [_walls(height, axis) for axis in (0, 1)]
-    nodes = np.arange(0.0, max(size.max() for _, _, size in across) + 2 * _NODE_M, _NODE_M)
+    nodes = np.arange(0.0, max(size.max() for *_, size in across) + 2 * _NODE_M, _NODE_M)
     table = {
-        way: CubicSpline(nodes, edge_widths(tuple(nodes.tolist()), wavelength_m, index, way)) for way in ("TE", "TM")
+        way: [
+            CubicSpline(nodes, of(tuple(nodes.tolist()), wavelength_m, index, way))
+            for of in (edge_widths, edge_dipoles)
+        ]
+        for way in ("TE", "TM")
     }
     fields = []
     for polarised in (0, 1):
-        field = thin.copy()
-        for axis, (places, low, size) in enumerate(across):
+        field, aside = thin.copy(), [np.zeros_like(thin) for _ in across]
+        for axis, (places, low, rises, size) in enumerate(across):
             # Light polarised across a wall is TM.
-            width, below = table["TM" if polarised == axis else "TE"](size), waves * (index * low - (low + size))
-            line = width * np.exp(1j * below) / step / 2
+            width, own = (one(size) for one in table["TM" if polarised == axis else "TE"])
+            air = np.exp(1j * waves * (index * low - (low + size)))
+            step_of_light = np.exp(1j * waves * (index - 1) * (low + size)) - np.exp(1j * waves * (index - 1) * low)
+            stands = 1j / (2 * waves * index) * (low - height.mean()) * step_of_light
+            dipole = rises * (stands + own * air)
             for beside in (0, 1):
-                rows, columns = (place + beside * (k == axis) for k, place in enumerate(places))
-                np.add.at(field, (rows, columns), line)
-        fields.append(field)
+                at = tuple(place + beside * (k == axis) for k, place in enumerate(places))
+                np.add.at(field, at, width * air / step / 2 + (1 - 2 * beside) * dipole / step**2)
+                np.add.at(aside[axis], at, dipole / step / 2)
+        fields.append((field, *aside))
     return fields
 
 
-def _walls(height: np.ndarray, axis: int) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Samples before a wall, the height of its lower side, and of the wall, metres."""
+def _walls(height: np.ndarray, axis: int) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    """Samples before a wall, the height of its lower side, whether it rises (1 or -1), and its height, metres."""
     jump = np.diff(height, axis=axis)
     places = np.nonzero(np.abs(jump) > _WALL_M)
     behind = tuple(p + (a == axis) for a, p in enumerate(places))
-    return places, np.minimum(height[places], height[behind]), np.abs(jump[places])
+    return places, np.minimum(height[places], height[behind]), np.sign(jump[places]), np.abs(jump[places])

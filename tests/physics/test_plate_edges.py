@@ -16,8 +16,8 @@ from sim.material import refractive_index
 from sim.metrics import zeroth_order
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import with_edges
-from sim.rigorous.edge_widths import relative_widths
-from sim.rigorous.rows import orders_of, row_slabs
+from sim.rigorous.edge_widths import edge_dipoles, edge_widths
+from sim.rigorous.rows import Polarisation, orders_of, row_slabs
 from sim.surface import as_fabricated
 
 CELL, STEP, BLUE, RED = 1.85e-6, 75e-9, 486e-9, 656e-9
@@ -111,11 +111,16 @@ def expected_orders(row: Row, wavelength_m: float, way: str) -> np.ndarray:
         if abs(rise) < 1e-12:
             return np.zeros(len(ORDERS))
         # TM where the field is across the walls.
-        width = relative_widths(
-            np.array([abs(rise)]), wavelength_m, index, way, "y" if row.walls_along == "x" else "x"
-        )[0]
-        below = np.exp(2j * np.pi * rate * (height - max(rise, 0)))
-        return width / CELL * below * np.exp(-2j * np.pi * ORDERS * place / PERIOD)
+        known: dict[str, tuple[Polarisation, ...]] = {"unpolarised": ("TE", "TM"), row.walls_along: ("TE",)}
+        ways = known.get(way, ("TM",))
+        given, foot = ((abs(rise),), wavelength_m, index), height - max(rise, 0)
+        air = np.exp(-2j * np.pi * abs(rise) / wavelength_m)
+        width, dipole = (air * np.mean([of(*given, one)[0] for one in ways]) for of in (edge_widths, edge_dipoles))
+        below, above = (np.exp(2j * np.pi * rate * at) for at in (foot, foot + abs(rise)))
+        stands = 1j * wavelength_m / (4 * np.pi * index) * (foot - TOP / 2) * (above - below)
+        dipole = np.sign(rise) * (stands + dipole * below) / CELL**2
+        waves = ORDERS / PERIOD
+        return (width / CELL * below + 2j * np.pi * waves * dipole) * np.exp(-2j * np.pi * waves * place)
 
     for border in row.walls():
         left = 0.0

@@ -5,6 +5,7 @@ import pytest
 
 from sim.material import refractive_index
 from sim.rigorous import Slab, compare_row, edge_widths, orders_of, row_slabs, thin_amplitudes
+from sim.rigorous.edge_widths import edge_dipoles, light_of_walls
 from sim.rigorous.rows import POLARISATIONS, Polarisation
 
 CELL, STEP = 1.85e-6, 75e-9
@@ -109,6 +110,68 @@ def test_widths_do_not_depend_on_the_ridge_they_are_taken_from(polarisation: Pol
         assert 200e-9 < np.abs(width).max() < 450e-9
 
 
+@pytest.mark.parametrize("polarisation", POLARISATIONS)
+def test_dipoles_do_not_depend_on_the_ridge_they_are_taken_from(polarisation: Polarisation):
+    """To 2 % of the strongest: the odd orders of a ridge fall off slower with its period than the 0th."""
+    heights, wavelength = tuple(STEP * np.arange(16)), 0.552e-6
+    dipole = edge_dipoles(heights, wavelength, silica(wavelength), polarisation)
+    others = ({"period": 96.0}, {"waves": 6.0})
+    for other in others:
+        found = edge_dipoles(heights, wavelength, silica(wavelength), polarisation, **other)
+        assert np.abs(found - dipole).max() < 0.02 * np.abs(dipole).max()
+    assert dipole[0] == pytest.approx(0, abs=1e-20)
+
+
+def test_dipoles_of_a_wall_of_hardly_any_glass_are_those_of_parabolic_light():
+    """A step of light t at half the height of the wall spreads on its way down: i h t / (4 k n)."""
+    wavelength, index = 0.552e-6, 1.02
+    height, waves = np.array([0.3e-6, 0.6e-6, 1e-6, 2e-6]), 2 * np.pi / wavelength
+    step = np.exp(1j * waves * index * height) - np.exp(1j * waves * height)
+    found = [edge_dipoles(tuple(height.tolist()), wavelength, index, way) for way in POLARISATIONS]
+    ratio = np.mean(found, axis=0) / (1j * height * step / (4 * waves * index))
+    # What is left is that of walls not much higher than half a wave, and of light too steep for a parabola.
+    assert np.abs(ratio - 1).max() < 0.08
+
+
+@pytest.mark.parametrize("polarisation", POLARISATIONS)
+@pytest.mark.parametrize(("seed", "sine"), [(7, 0.0), (7, 0.044), (2, 0.044)])
+def test_dipoles_turn_with_the_light_onto_the_walls(polarisation: Polarisation, seed: int, sine: float):
+    """Rows of random levels lit from afar, and as the rim is by a source at 5 cm: 0.2 to 0.6 % off, 1.2 to 1.9 without.
+
+    Light that comes from a side sees what stands higher to the side: q onto the wall counts twice.
+    """
+    wavelength = 0.552e-6
+    index, cells = silica(wavelength), 20
+    height, period = STEP * np.random.default_rng(seed).integers(0, 16, cells), cells * CELL
+    number, thin = thin_amplitudes(height, CELL, wavelength, index)
+    walls = light_of_walls(
+        np.roll(height, 1),
+        height,
+        wavelength,
+        index,
+        polarisation,
+        plane_m=float(height.mean()),
+        top_m=float(height.max()),
+    )
+    places = (np.arange(cells) - cells / 2) * CELL
+    lines, dipoles = (np.exp(-2j * np.pi * np.outer(number, places) / period) @ one / period for one in walls)
+    slabs = row_slabs(height, CELL, index)
+    solved = orders_of(slabs, wavelength, index, polarisation, int(1.5 * period * index / wavelength), sine=sine)
+    first = solved.at(int(number[0]))
+    # Over what a bare face lets through.
+    bare = orders_of(
+        [Slab(slabs[0].edges_m, np.full(cells, index**2), 1e-15)], wavelength, index, polarisation, 3, sine=sine
+    )
+    rigorous = solved.transmitted[first : first + len(number)] / bare.transmitted[bare.at(0)]
+
+    def off(amplitude: np.ndarray) -> float:
+        return float(np.linalg.norm(np.abs(amplitude) ** 2 - rigorous) / np.linalg.norm(rigorous))
+
+    turned = 2j * np.pi * (number / period + 2 * sine / wavelength) * dipoles
+    assert off(thin + lines + turned) < 0.006
+    assert off(thin + lines + turned) < 0.5 * off(thin + lines)
+
+
 def test_a_thin_element_has_the_orders_of_the_closed_form():
     """A blazed row of N steps, each a phase of 1/N turn deeper: (sin(pi/N) / (pi/N))² in the first order."""
     wavelength = 0.552e-6
@@ -120,13 +183,14 @@ def test_a_thin_element_has_the_orders_of_the_closed_form():
 
 
 @pytest.mark.parametrize("wavelength", [0.45e-6, 0.552e-6, 0.656e-6])
-def test_edges_make_a_thin_element_nearly_rigorous(wavelength: float):
-    """Rows of random levels: thin elements are off by 7-10 %, with edges by less than 1 %."""
-    height = STEP * np.random.default_rng(5).integers(0, 16, 14)
+@pytest.mark.parametrize("seed", [5, 7, 22])
+def test_edges_make_a_thin_element_nearly_rigorous(wavelength: float, seed: int):
+    """Rows of random levels: thin elements are off by 5-20 %, with edges by 0.6 % at most of 144 such."""
+    height = STEP * np.random.default_rng(seed).integers(0, 16, 14 if seed == 5 else 20)
     found = compare_row(height, CELL, wavelength, silica(wavelength))
     assert found.energy == pytest.approx([1, 1], abs=1e-12)
     assert found.error(found.scalar).min() > 0.04
-    assert found.error(found.edges).max() < 0.01
+    assert found.error(found.edges).max() < 0.006
     # A tenth of a point of the light.
     assert found.zeroth(found.edges) == pytest.approx(found.zeroth(found.rigorous), abs=1e-3)
 

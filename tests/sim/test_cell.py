@@ -13,6 +13,7 @@ from scipy.integrate import quad_vec
 from sim.surface.cell import (
     DEGREE,
     DEGREES,
+    DIPOLE,
     LINE_DEGREE,
     REACH,
     Cuts,
@@ -176,13 +177,23 @@ def weights_of(low: float, high: float) -> np.ndarray:
 def test_weights_of_lines_look_like_lines_near_the_lower_border(low: float, high: float, limit: float):
     """A line a little off the border is the sum over powers of its place; the third, left out, is 0.3 % here."""
     u, place = np.linspace(low, high, 201), 0.04
-    weights = moment_weights(np.array([low]), np.array([high]))[0, DEGREE:]
+    weights = moment_weights(np.array([low]), np.array([high]))[0, DEGREE : DEGREE + DIPOLE]
     assert len(weights) == LINE_DEGREE + 1
     found = sum(place**q * seen_from(u, row) for q, row in enumerate(weights))
     error = np.abs(found - np.exp(-2j * np.pi * u * (place - 0.5)))
     assert np.sqrt(np.mean(error**2)) < limit + np.mean((2 * np.pi * np.abs(u) * place) ** 3) / 6
     # Light on the axis is that of the line wherever it lies.
     np.testing.assert_allclose(weights.sum(1), [1, 0, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize(("low", "high", "limit"), [(-0.1, 0.1, 1e-3), (-0.4, 0.4, 5e-3), (-0.6, 0.2, 1e-2)])
+def test_weights_of_dipoles_look_like_dipoles_on_the_lower_border(low: float, high: float, limit: float):
+    """Where light onto the cell comes from a side, at minus the middle of the band, it counts twice."""
+    u, onto = np.linspace(low, high, 201), -(low + high) / 2
+    weights = moment_weights(np.array([low]), np.array([high]))[0, DEGREE + DIPOLE]
+    error = np.abs(seen_from(u, weights) - 2j * np.pi * (u + 2 * onto) * np.exp(1j * np.pi * u))
+    assert np.sqrt(np.mean(error**2)) < limit  # of 0.4 to 3
+    assert weights.sum() == pytest.approx(4j * np.pi * onto, abs=1e-4)
 
 
 @pytest.mark.parametrize(

