@@ -140,11 +140,11 @@ def _forward(height_m: Array, rate: Any, across_y: Walls, across_x: Walls) -> tu
         # Cheaper to compute for every cell that has a part of it than to write down.
         dipoles = _dipoles(around.sides(axis, _reach(walls.dipole_weights)), walls)
         cells += [_to_cells(lit, walls.weights, axis), _to_cells(dipoles, walls.dipole_weights, axis)]
-    return jax.lax.complex(*_sum(cells)), (height_m, rate, across_y, across_x)
+    return jax.lax.complex(*_sum(cells)), (around, rate, across_y, across_x)
 
 
 def _backward(kept: tuple[Any, ...], cotangent: Array) -> tuple[Array, None, None, None]:
-    height, rate, *both = kept
+    around, rate, *both = kept
     given = cotangent.real, cotangent.imag
 
     def borders(*padded: Parts) -> list[list[Parts]]:
@@ -157,15 +157,14 @@ def _backward(kept: tuple[Any, ...], cotangent: Array) -> tuple[Array, None, Non
         return [_slopes(around.sides(axis, 1), rate, both[axis], *seen[axis]) for axis in range(2)]
 
     padded = [tuple(jnp.pad(part, _ends(walls.reach, axis)) for part in given) for axis, walls in enumerate(both)]
-    around = _Cells.of(height, rate, 1)
     found = _once(slopes, around, _once(borders, *padded))
     thin = around.inner()
     slope = -(2 * np.pi * rate) * (given[0] * thin[1] + given[1] * thin[0])
     for axis, (of_before, of_behind, of_plane) in enumerate(found):
-        # A cell lies behind the first border and before the second; beyond the rim heights are those of the rim.
-        count = height.shape[axis]
-        place = jax.lax.broadcasted_iota(jnp.int32, height.shape, axis)
-        slope = slope + jnp.where(place > 0, _slice(of_behind, 0, count, axis), 0.0) + of_plane / height.size
+        # A cell lies behind the first border and before the second.
+        count = slope.shape[axis]
+        place = jax.lax.broadcasted_iota(jnp.int32, slope.shape, axis)
+        slope = slope + jnp.where(place > 0, _slice(of_behind, 0, count, axis), 0.0) + of_plane / slope.size
         slope = slope + jnp.where(place < count - 1, _slice(of_before, 1, count, axis), 0.0)
     return slope, None, None, None
 
@@ -226,7 +225,7 @@ class _Sides(NamedTuple):
 
 
 class _Cells(NamedTuple):
-    """Cells, and as many as lie within reach of them beyond all borders, where those of the rim go on."""
+    """Cells, and as many of no height as lie within reach of them beyond the rim."""
 
     height_m: Array
     real: Array
@@ -239,7 +238,7 @@ class _Cells(NamedTuple):
         """Cells and their light, computed once for all."""
 
         def around(height_m: Array) -> tuple[Array, Array, Array]:
-            padded = jnp.pad(height_m, reach, "edge")
+            padded = jnp.pad(height_m, reach)
             lit = cis(padded * rate)
             return padded, lit.real, lit.imag
 
@@ -252,13 +251,18 @@ class _Cells(NamedTuple):
         return self.real[reach:-reach, reach:-reach], self.imag[reach:-reach, reach:-reach]
 
     def sides(self, axis: int, reach: int) -> _Sides:
-        """The sides of all borders along an axis, and of as many beyond its ends as lie within a shorter reach."""
+        """The sides of all borders along an axis, and of as many beyond its ends as lie within a shorter reach.
+
+        These, that of the rim among them, are no walls: both sides are alike.
+        """
         own = len(self.reach)
         size = [n - 2 * own for n in self.height_m.shape]
 
         def pair(values: Array) -> Parts:
             values = _slice(values, own, size[1 - axis], 1 - axis)
-            return _neighbours(_slice(values, own - reach, size[axis] + 2 * reach, axis), axis)
+            before, behind = _neighbours(_slice(values, own - reach, size[axis] + 2 * reach, axis), axis)
+            place = jax.lax.broadcasted_iota(jnp.int32, before.shape, axis)
+            return jnp.where((place >= reach) & (place < reach + size[axis] - 1), before, behind), behind
 
         low, high = pair(self.height_m)
         before, behind = zip(pair(self.real), pair(self.imag), strict=True)
