@@ -127,10 +127,10 @@ def moment_weights(
 
     A cell's far field is sinc(u). The sum of weights times exp(-2 pi i u k) sinc(u) is fitted by least squares to
     (2q+1) (-i)^q j_q(pi u), the far field of moment q, to exp(i pi u) (-2 pi i u)^q / q!, that of a line's moment, and
-    to 2 pi i (u + 2 v) exp(i pi u), that of a dipole (`sim.rigorous.edge_optic.dipole_weights`), for wave numbers u from
-    `low` to `high`, waves per cell: those of light to a pixel less that of the light on the cell, v. Any band narrower
-    than 1 can be fitted, wherever it lies. `slope` is how much more obliquely each cell is lit than the one before,
-    waves per cell. Near the border of the grid only the cells `within` some places have weights.
+    to 2 pi i (u + 2 v) exp(i pi u), that of a dipole (`sim.rigorous.edge_optic.dipole_weights`), for wave numbers u
+    from `low` to `high`, waves per cell: those of light to a pixel less that of the light on the cell, v. Any band
+    narrower than 1 can be fitted, wherever it lies. `slope` is how much more obliquely each cell is lit than the one
+    before, waves per cell. Near the border of the grid only the cells `within` some places have weights.
 
     The weights of all kinds but a line's light itself, whose weights sum to 1, and of dipoles that are lit obliquely,
     have no effect on the axis, so that they leave the mean of a plate alone; they are real for a band that is symmetric
