@@ -85,8 +85,19 @@ def edge_dipoles(
 ) -> Complex[np.ndarray, " height"]:
     """Dipoles, square metres, of walls that rise along the axis, told at the plane of their foot.
 
-    Arguments and sign as of `edge_widths`. They include the half of a wall's height that its middle is above its foot,
-    and are those that fit light up to 10 degrees in air best.
+    They include the half of a wall's height that its middle is above its foot, and are those that fit light up to 10
+    degrees in air best.
+
+    Args:
+        heights_m: from one side of the wall to the other, not negative.
+        wavelength_m: vacuum wavelength.
+        index: refractive index of the glass.
+        polarisation: "TE" where the electric field is along the wall, "TM" where it is across.
+        period: of the ridges from which they are taken, in wavelengths.
+        waves: orders to either side that are kept, over those that travel in the glass.
+
+    Returns:
+        dipoles for light exp(i k z - i omega t); their complex conjugates for the other sign.
     """
     found = _ridge_orders(heights_m, wavelength_m, index, polarisation, period, waves)
     order = np.arange(1, int(_BAND * period) + 1, 2)

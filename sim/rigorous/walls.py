@@ -200,7 +200,7 @@ def _slice(values: Array, start: int, count: int, axis: int) -> Array:
 
 
 class _Sides(NamedTuple):
-    """What lies before and behind every border."""
+    """Heights and light of the cells before and behind every border."""
 
     before_m: Array
     behind_m: Array
@@ -280,7 +280,7 @@ def _product(one: Parts, other: Parts) -> Parts:
 
 
 def _dipole(walls: Walls, rise_m: Array, foot_m: Array) -> tuple[Parts, Parts]:
-    """What the step of the light, and the sum of the light of both sides, have in the dipole of a wall."""
+    """The dipole of a wall over the step of the light, and over the sum of the light of both sides."""
     numbers, height = tuple(zip(*walls.dipole, strict=True)), jnp.abs(rise_m)
     step = _each(lambda a, b, c, d: height * ((c - a) / 2 + (d - b) / 2 * height), *numbers)
     both = _each(lambda a, b, c, d: rise_m * ((a + c) / 2 + (b + d) / 2 * height), *numbers)
@@ -332,7 +332,7 @@ def _slopes(sides: _Sides, rate: Any, walls: Walls, of_lines: Parts, of_dipoles:
 
 
 def _dipole_slope(walls: Walls, rise_m: Array) -> tuple[Parts, Parts]:
-    """Derivatives of `_dipole` by the rise."""
+    """Derivatives of both by the rise."""
     numbers, height, sign = tuple(zip(*walls.dipole, strict=True)), jnp.abs(rise_m), jnp.sign(rise_m)
     step = _each(lambda a, b, c, d: sign * ((c - a) / 2 + (d - b) * height), *numbers)
     return step, _each(lambda a, b, c, d: (a + c) / 2 + (b + d) * height, *numbers)
