@@ -41,6 +41,7 @@ from sim.tracing import is_traced
 # split; lines are about a tenth of the light.
 _GOOD, _WORST, _MOST_TAPS = 0.003, 0.03, 10
 _GOOD_DIPOLE = 0.08  # of dipoles, over their own
+_WIDEST_LIGHT = 0.2  # waves per cell from a far to a near source's light on the rim, for which dipoles of one view do
 _SHARES = 33  # of the way from the axis to the rim, for which weights are fitted
 
 
@@ -154,8 +155,8 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
 
 def _is_seen(camera: Camera, wavelength_m: float, depths_m: Sequence[float], parts: int) -> bool:
     """Whether weights on parts of cells do for the light of walls, from all these depths alike."""
-    waves = oblique_waves(camera, wavelength_m, depths_m).over(parts)
-    return line_weights(*waves, camera.opening)[1] <= _WORST
+    waves = oblique_waves(camera, wavelength_m, depths_m)
+    return waves.high - waves.low <= _WIDEST_LIGHT and line_weights(*waves.over(parts), camera.opening)[1] <= _WORST
 
 
 def _views(camera: Camera, wavelength_m: float, depths_m: tuple[float, float], parts: int) -> list[View]:
@@ -219,8 +220,8 @@ def dipole_weights(seen: float, low: float, high: float, aperture: Aperture) -> 
     """Weights on the cells to either side of a wall whose far field is that of its dipole.
 
     Arguments as of `line_weights`. The far field is 2 pi i times the sum of the wave number of light to a pixel and
-    that of the light on the cell: where that is oblique, what stands higher is seen to the side. Dipoles are a fiftieth
-    of the light, and a tenth of them may be missed.
+    that of the light on the cell: where that is oblique, what stands higher is seen to the side. Of sources at several
+    depths the middle counts. Dipoles are a fiftieth of the light, and a tenth of them may be missed.
     """
     share = np.linspace(0, 1, _SHARES)
     waves = np.linspace(-seen - share * high, seen - share * low, 300)

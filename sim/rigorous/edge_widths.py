@@ -9,8 +9,8 @@ with a complex width w of a few nanometres to a third of a micrometre. It is tak
 ridge as high as the wall and half as wide as its period, of which the rigorous 0th order, over what a bare face lets
 through, differs from the thin element's by 2 w / period.
 
-That line of light does not leave from the wall's foot. A step spreads as it goes down through the glass under it, and
-more the higher it stands: h of glass turn a wave number q by exp(-i q² h / (2 k n)). To first order that adds a pair of
+Relief has a depth, too. The step of the light at a wall spreads on its way down through the glass under it, the more
+the higher it stands: h of glass turn a wave number q by exp(-i q² h / (2 k n)). To first order that adds a pair of
 lines of opposite sign, a dipole, to every wall, p delta'(x - x_wall), where
 
     p = i / (2 k n) (h_middle - h_plane) (t_behind - t_before) + the wall's own

@@ -224,14 +224,14 @@ class _Sides(NamedTuple):
         return _each(lambda before, behind: jnp.where(self.rise_m > 0, before, behind), self.before, self.behind)
 
 
-class _Cells(NamedTuple):
+class _Cells(eqx.Module):
     """Cells, and as many of no height as lie within reach of them beyond the rim."""
 
     height_m: Array
     real: Array
     imag: Array
     plane_m: Array  # mean height
-    reach: Array  # of no size but that of the reach
+    reach: int = eqx.field(static=True)
 
     @classmethod
     def of(cls, height_m: Array, rate: Any, reach: int) -> "_Cells":
@@ -243,11 +243,11 @@ class _Cells(NamedTuple):
             return padded, lit.real, lit.imag
 
         padded, real, imag = _once(around, height_m)
-        return cls(padded, real, imag, jnp.mean(height_m), jnp.zeros((reach, 0)))
+        return cls(padded, real, imag, jnp.mean(height_m), reach)
 
     def inner(self) -> Parts:
         """Light of the cells themselves."""
-        reach = len(self.reach)
+        reach = self.reach
         return self.real[reach:-reach, reach:-reach], self.imag[reach:-reach, reach:-reach]
 
     def sides(self, axis: int, reach: int) -> _Sides:
@@ -255,7 +255,7 @@ class _Cells(NamedTuple):
 
         These, that of the rim among them, are no walls: both sides are alike.
         """
-        own = len(self.reach)
+        own = self.reach
         size = [n - 2 * own for n in self.height_m.shape]
 
         def pair(values: Array) -> Parts:

@@ -27,7 +27,7 @@ def test_every_shipped_table_is_one_of_the_stock_process():
 def test_a_shipped_table_is_the_computed_one(key: WidthKey):
     # Another order of the same sums; the widths themselves are good to 2 nm.
     for shipped, computed in zip(shipped_tables()[key], key.computed(), strict=True):
-        np.testing.assert_allclose(shipped, computed, rtol=1e-4, atol=1e-14)
+        np.testing.assert_allclose(shipped, computed, atol=1e-14)
 
 
 @pytest.mark.study
