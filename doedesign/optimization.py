@@ -200,8 +200,8 @@ def _polished(spec: Spec, problem: Problem, sources: SourceSet, state: Optimizat
         def advance(move: int, loss: float) -> None:
             progress.advance(move, f"loss {loss:.4f}")
 
-        parameters = descend(spec, problem, sources, state.parameters, spec.optimize.polish, advance)
-    return state._replace(parameters=parameters)
+        parameters = descend(spec, problem, sources, state.settled, spec.optimize.polish, advance)
+    return state._replace(parameters=parameters, mean=None)
 
 
 def _reader(spec: Spec) -> Callable[[Path], np.ndarray]:
@@ -212,16 +212,16 @@ def _resume(
     run: Run, problem: Problem, sources: SourceSet, files: dict[str, Path]
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
     empty = empty_state(run.spec, problem, sources)
-    leaves, tree = jax.tree.flatten((empty.parameters, empty.adam, empty.printed, empty.robust))
+    leaves, tree = jax.tree.flatten(empty.kept)
     stored = load_checkpoint(run, leaves)
     if stored is None:
         log.info(f'starting from "{run.spec.optimize.start}"')
         return initial_state(run.spec, problem, sources, files, _reader(run.spec)), []
     arrays, step, history = stored
     log.info(f"resuming after step {step}")
-    parameters, adam, printed, robust = jax.tree.unflatten(tree, arrays)
-    parameters, adam = jax.tree.map(jnp.asarray, (parameters, adam))
-    return OptimizationState(parameters, adam, step, printed, robust), history
+    parameters, adam, printed, robust, mean = jax.tree.unflatten(tree, arrays)
+    parameters, adam, mean = jax.tree.map(jnp.asarray, (parameters, adam, mean))
+    return OptimizationState(parameters, adam, step, printed, robust, mean), history
 
 
 def _aimed_task(spec: Spec) -> Any:

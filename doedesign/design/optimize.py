@@ -10,11 +10,17 @@ ever, and how high that level stands has a true gradient.
 
 Where masks have to obey rules, the second half of the steps looks at level maps that do
 (`doedesign.design.levels.printable`).
+
+Long runs end with the mean of their last phases. The longer a run, the more cells stand where a small step takes them to
+another level, many at once: the spot's energy swings, and the last step is as good as chance has it. Measured on the
+quick example, four seeds: loss 1.155 after 120 steps, 1.148 after 240 and 1.147 with the mean, 1.160 after 480 and 1.144
+with it.
 """
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +47,8 @@ from fab.levels import Levels
 from sim.aperture import open_cells
 
 _WARMING = 20  # steps over which the step size grows, at most
+_LONG = 200  # steps, beyond which a run is long
+_NEWEST = 0.1  # share of the newest phases in their mean; 0.03 is as good
 
 
 class OptimizationState(NamedTuple):
@@ -53,6 +61,8 @@ class OptimizationState(NamedTuple):
         printed: `[y, x]` levels that the last step looked at, of a design whose masks obey rules; blank before the
             first such step, and None for other designs.
         robust: what the steps of a robust design change; None for other designs.
+        mean: mean of the parameters of the last steps, each weighed a tenth less than the next; None for short runs,
+            and for those whose masks obey rules.
     """
 
     parameters: Parameters
@@ -60,11 +70,22 @@ class OptimizationState(NamedTuple):
     step: int
     printed: UInt8[np.ndarray, "y x"] | None = None
     robust: RobustState | None = None
+    mean: Parameters | None = None
+
+    @property
+    def settled(self) -> Parameters:
+        """The parameters that make the design."""
+        return self.parameters if self.mean is None else self.mean
+
+    @property
+    def kept(self) -> tuple[Any, ...]:
+        """What a checkpoint keeps beside the number of steps."""
+        return self.parameters, self.adam, self.printed, self.robust, self.mean
 
     @property
     def arrays(self) -> list[np.ndarray]:
         """Arrays that a checkpoint keeps."""
-        return [np.asarray(leaf) for leaf in jax.tree.leaves((self.parameters, self.adam, self.printed, self.robust))]
+        return [np.asarray(leaf) for leaf in jax.tree.leaves(self.kept)]
 
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
@@ -127,7 +148,9 @@ def _state_of(spec: Spec, problem: Problem, scene: SourceSet, radians: Array) ->
     if spec.robust is not None:
         robust = RobustTask.of(spec, problem, scene).initial_state(np.zeros(radians.shape, np.uint8))
     printed = None if rules is None else rules.blank.level
-    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0, printed, robust)
+    # A copy: steps reuse the memory of their parameters.
+    mean = jax.tree.map(jnp.copy, parameters) if rules is None and spec.optimize.steps > _LONG else None
+    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0, printed, robust, mean)
 
 
 def printable_levels(spec: Spec, problem: Problem) -> PrintableLevels | None:
@@ -147,6 +170,11 @@ def first_parameters(spec: Spec, radians: Array) -> Parameters:
 @eqx.filter_jit
 def _height_of(parametrization: LevelParametrization, parameters: Parameters, rounding: Rounding) -> Array:
     return parametrization.height_of(parameters, rounding)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _mean_with(mean: Parameters, newest: Parameters) -> Parameters:
+    return jax.tree.map(lambda old, new: old + _NEWEST * (new - old), mean, newest)
 
 
 def make_update(optimiser: optax.GradientTransformation) -> Callable[[Any, Any], Any]:
@@ -225,7 +253,8 @@ def steps(
         before = state.parameters, state.adam
         if rules is None or step < first_printed(spec.optimize.steps):
             (parameters, adam), loss, terms = update(inputs, before)
-            state = state._replace(parameters=parameters, adam=adam, step=step + 1)
+            mean = None if state.mean is None else _mean_with(state.mean, parameters)
+            state = state._replace(parameters=parameters, adam=adam, step=step + 1, mean=mean)
         else:
             level = _printed(rules, problem, spec, state)
             height = problem.parametrization.drawn_height(level)
@@ -255,7 +284,7 @@ def _last_level(spec: Spec, problem: Problem, state: OptimizationState) -> UInt8
         return state.robust.level
     if (rules := printable_levels(spec, problem)) is not None:
         return _printed(rules, problem, spec, state)
-    return np.asarray(parametrization.level(parametrization.continuous_m(state.parameters.radians))).astype(np.uint8)
+    return np.asarray(parametrization.level(parametrization.continuous_m(state.settled.radians))).astype(np.uint8)
 
 
 def finished_design(
@@ -264,7 +293,7 @@ def finished_design(
     """Return the design of the parameters: every cell at its nearest level, and the heights before rounding."""
     parametrization, camera = problem.parametrization, problem.camera
     robust = state.robust if state.step > spec.optimize.steps else None
-    parameters = state.parameters if robust is None else robust.parameters
+    parameters = state.settled if robust is None else robust.parameters
     drawn = parametrization.continuous_m(parameters.radians)
     continuous = problem.optic.raster(np.asarray(parametrization.cells(drawn)))
     levels = parametrization.levels
@@ -295,7 +324,7 @@ def _chosen_levels(problem: Problem, state: OptimizationState, continuous_m: Flo
     """Return the chosen staircase as a recipe holds it: the one learnt, or that which suits the heights best."""
     parametrization, camera = problem.parametrization, problem.camera
     start = parametrization.levels
-    if (ratio := state.parameters.log_depth_ratio) is not None:
+    if (ratio := state.settled.log_depth_ratio) is not None:
         depths_m = recipe_depths_m(np.asarray(parametrization.depths_m(ratio)), start)
         with contextlib.suppress(InputError):  # two levels met
             return Levels(start.count, start.step_m, depths_m)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from doedesign import optimization
+from doedesign.design import optimize as optimization_loop
 from doedesign.design.descent import descend, looks_of
 from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
 from doedesign.design.problem import losses, problem_of, value_and_slope, view_of
@@ -127,13 +128,34 @@ def test_colours_that_are_compared_cannot_be_looked_at_in_turn() -> None:
 
 
 @pytest.mark.slow
-def test_resumed_run_has_the_same_bits() -> None:
+def test_long_runs_end_with_the_mean_of_their_last_phases(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optimization_loop, "_LONG", 11)
+    spec = load_spec(EXAMPLES / "quick.toml", SMALL)
+    problem, scene = problem_of(spec, {})
+    state = initial_state(spec, problem, scene, {}, unread)
+    mean = np.asarray(state.parameters.radians)
+    for state, _ in steps(spec, problem, scene, state):  # noqa: B020 - goes on from the one before
+        mean = mean + np.float32(0.1) * (np.asarray(state.parameters.radians) - mean)
+    assert state.mean is not None
+    np.testing.assert_allclose(state.mean.radians, mean, atol=1e-5)  # float32 of some radians, twelve times
+    design = finished_design(spec, problem, state)
+    np.testing.assert_array_equal(design.continuous_m, problem.parametrization.continuous_m(state.mean.radians))
+    short, _ = run(load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.steps=11"]))
+    assert short.mean is None
+    printable, _ = run(load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.min_feature=2 um"]))
+    assert printable.mean is None
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_resumed_run_has_the_same_bits(long: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if long:
+        monkeypatch.setattr(optimization_loop, "_LONG", 11)
     spec = load_spec(EXAMPLES / "quick.toml", SMALL)
     whole, history = run(spec)
     half, first = run(spec, stop=5)
     resumed, second = run(spec, start=jax.tree.map(jnp.asarray, half)._replace(step=5))
     assert first + second == history
-    assert np.array_equal(whole.parameters.radians, resumed.parameters.radians)
+    assert np.array_equal(whole.settled.radians, resumed.settled.radians)
 
 
 @pytest.mark.slow
