@@ -11,10 +11,10 @@ ever, and how high that level stands has a true gradient.
 Where masks have to obey rules, the second half of the steps looks at level maps that do
 (`doedesign.design.levels.printable`).
 
-Long runs end with the mean of their last phases. The longer a run, the more cells stand where a small step takes them to
-another level, many at once: the spot's energy swings, and the last step is as good as chance has it. Measured on the
-quick example, four seeds: loss 1.155 after 120 steps, 1.148 after 240 and 1.147 with the mean, 1.160 after 480 and 1.144
-with it.
+Long runs end with the mean of their last phases. The longer a run, the more cells stand where a small step takes them
+to another level, many at once: the spot's energy swings, and the last step is as good as chance has it. Measured on the
+quick example, four seeds: loss 1.155 after 120 steps, 1.148 after 240 and 1.147 with the mean, 1.160 after 480 and
+1.144 with it.
 """
 
 import contextlib
