@@ -5,7 +5,8 @@ the modes of every layer and joins the layers by scattering matrices. The field 
 displacement across it, which a transform has to know to converge: fmmax is given the direction of walls everywhere. Of
 2 x 2 random cells of 1.85 um at 552 nm, 400 terms then leave an error of 0.08 % of the orders, as they do with the
 directions that fmmax finds by itself in twice the time; without directions 500 terms leave 0.24 %. (Against 700 terms
-by the rule for rectangles, L. Li, J. Opt. Soc. Am. A 14, 2758 (1997).)
+by the rule for rectangles, L. Li, J. Opt. Soc. Am. A 14, 2758 (1997).) Walls of ten and more steps of 75 nm take more
+terms: 364 leave 0.1 to 1.0 % of six such squares (against 975).
 Double precision throughout.
 """
 
