@@ -79,7 +79,7 @@ class OptimizationState(NamedTuple):
 
     @property
     def kept(self) -> tuple[Any, ...]:
-        """What a checkpoint keeps beside the number of steps."""
+        """All that a checkpoint keeps beside the number of steps."""
         return self.parameters, self.adam, self.printed, self.robust, self.mean
 
     @property
