@@ -24,8 +24,8 @@ PLACES = 1 + 3 * 4  # one in the middle, and three at every other share
 # Orders of the rigorous solutions over those that travel in glass: the finer is believed, the other tells how far.
 _WAVES = (1.5, 2.0)
 # Highest wave number of the terms of a square over that which travels in glass. A square takes time with the sixth
-# power; of 2 x 2 random cells at 552 nm the terms of 1.0 leave 0.5 %, those of 1.15 0.08 %, those of 1.3 0.04 %; of those
-# with walls of 0.75 um and more the terms of 1.1 leave 0.1 to 1.0 %.
+# power; of 2 x 2 random cells at 552 nm the terms of 1.0 leave 0.5 %, those of 1.15 0.08 %, those of 1.3 0.04 %. Of
+# squares with walls of 0.75 um and more the terms of 1.1 leave 0.1 to 1.0 %.
 _PIECE_WAVES = (1.1, 1.25)
 
 
