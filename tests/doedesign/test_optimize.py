@@ -146,6 +146,7 @@ def test_long_runs_end_with_the_mean_of_their_last_phases(monkeypatch: pytest.Mo
     assert printable.mean is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("long", [False, True])
 def test_resumed_run_has_the_same_bits(long: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if long:
@@ -155,6 +156,7 @@ def test_resumed_run_has_the_same_bits(long: bool, monkeypatch: pytest.MonkeyPat
     half, first = run(spec, stop=5)
     resumed, second = run(spec, start=jax.tree.map(jnp.asarray, half)._replace(step=5))
     assert first + second == history
+    assert np.array_equal(whole.parameters.radians, resumed.parameters.radians)
     assert np.array_equal(whole.settled.radians, resumed.settled.radians)
 
 
