@@ -24,6 +24,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """
     for name, path in pictures.draw_all(CACHE).items():
         files.append(File.generated(config, f"pictures/{name}.png", abs_src_path=str(path)))
-    for path in sorted(RESULTS.glob("*.png")):
-        files.append(File.generated(config, f"results/{path.name}", abs_src_path=str(path)))
+    for path in sorted(RESULTS.rglob("*.png")):
+        shown = f"results/{path.relative_to(RESULTS).as_posix()}"
+        files.append(File.generated(config, shown, abs_src_path=str(path)))
     return files

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 REGIONS, SCORES = ("occluded", "full"), ("ssim", "psnr", "closeness")
 HEADS = {"ssim": "SSIM", "psnr": "PSNR, dB", "closeness": "1 - LPIPS"}
 REFERENCE = "proposed"
+LATER = "of a later run: its differences are to that run's own proposed row"
 _SHOWN_PAIRS = 3
 
 
@@ -55,6 +56,7 @@ class TableRow:
         why: why it could not be computed.
         parameters: numbers that its network has learnt; 0 without one.
         original: those of the original, where the network is one after a published idea and they are known.
+        run: 1 for the run that the table is of, 2 and more for rows that were joined to it from later ones.
     """
 
     row: MethodRow
@@ -64,6 +66,12 @@ class TableRow:
     why: str = ""
     parameters: int = 0
     original: int | None = None
+    run: int = 1
+
+    @property
+    def label(self) -> str:
+        """Name for people, with a dagger if it is of a later run."""
+        return self.row.label + (" †" if self.run > 1 else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +103,11 @@ class EvaluationTable:
         return folder_name(self.number, self.obstruction, self.study["occlusion"])
 
     @property
+    def joined(self) -> bool:
+        """Whether it has rows of later runs."""
+        return any(one.run > 1 for one in self.rows)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Scores that some row has."""
         return tuple(s for s in SCORES if any(one.scores and one.scores["full"].get(s) for one in self.rows))
@@ -107,12 +120,12 @@ class EvaluationTable:
         )
         for one in self.rows:
             if one.why:
-                lines.append(f"{one.row.label:48}  {one.why}")
+                lines.append(f"{one.label:48}  {one.why}")
                 continue
             cells = "".join(f"{_cell(one.scores, score):>18}" for score in self.columns)
             paper = "" if one.paper is None else f"   {one.paper.psnr:.2f} ({one.paper.full_psnr:.2f}) dB"
-            lines.append(f"{one.row.label:48}{cells}{paper}{_size(one)}")
-        return "\n".join(lines)
+            lines.append(f"{one.label:48}{cells}{paper}{_size(one)}")
+        return "\n".join([*lines, *([f"† {LATER}"] if self.joined else [])])
 
     def csv(self) -> str:
         """A line for every row, region and score."""
@@ -129,7 +142,7 @@ class EvaluationTable:
                         continue
                     gain, paper = one.gain.get(region, {}).get(score), _paper(one.paper, region, score)
                     line = ScoreLine(one.row.name, region, score, **value._asdict(), paper=paper)
-                    line = line._replace(parameters=one.parameters, original_parameters=one.original)
+                    line = line._replace(parameters=one.parameters, original_parameters=one.original, run=one.run)
                     if gain is not None:
                         line = line._replace(gain=gain.mean, gain_low=gain.low, gain_high=gain.high)
                     found.append(line)
@@ -158,6 +171,7 @@ class EvaluationTable:
                 "paper": None if one.paper is None else one.paper._asdict(),
                 "parameters": one.parameters,
                 "original_parameters": one.original,
+                "run": one.run,
                 "why_not": one.why or None,
             }
             for one in self.rows
@@ -165,24 +179,32 @@ class EvaluationTable:
         return {"table": self.number, "study": dict(self.study), "pairs": len(self.pairs), "rows": rows}
 
     def latex(self) -> str:
-        r"""A `tabular` in the style of booktabs: the occluded region, in brackets the full image."""
-        heads = " & ".join(HEADS[score].replace(" - ", "--") for score in self.columns)
+        r"""A `tabular` in the style of booktabs: the occluded region, in brackets the full image; counts of weights."""
+        heads = [HEADS[score].replace(" - ", "--") for score in self.columns] + ["$10^6$ weights (original)"]
         lines = [
             f"% {self.title}; {len(self.pairs)} pairs",
-            r"\begin{tabular}{l" + "c" * len(self.columns) + "}",
+            r"\begin{tabular}{l" + "c" * len(heads) + "}",
             r"\toprule",
-            f" & {heads} \\\\",
+            f" & {' & '.join(heads)} \\\\",
             r"\midrule",
         ]
         for one in self.rows:
             cells = [_cell(one.scores, score) if not one.why else "--" for score in self.columns]
-            lines.append(" & ".join([_escaped(one.row.label), *cells]) + r" \\")
+            lines.append(" & ".join([_escaped(one.label), *cells, _weights(one)]) + r" \\")
+        if self.joined:
+            lines += [r"\midrule", rf"\multicolumn{{{len(heads) + 1}}}{{l}}{{\footnotesize $^\dagger$ {LATER}}} \\"]
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw PSNR in the occluded region with its intervals, a row for each method; return the figure."""
         shown = [one for one in self.rows if one.scores and one.scores["occluded"]["psnr"] is not None]
-        note = "95 % intervals of the mean over photographs and seeds; hollow: the paper's own pictures and scores"
+        values = [value for one in shown if (value := one.scores["occluded"]["psnr"])]
+        over = "photographs and seeds" if max((v.seeds for v in values), default=1) > 1 else "photographs, one seed"
+        note = f"95 % intervals of the mean over {over}"
+        if any(one.paper for one in shown):
+            note += "; hollow: the paper's own pictures and scores"
+        if self.joined:
+            note += f". † {LATER}"
         with panels(ax, (6.4, 0.24 * len(shown) + 1.1), self.title, note) as figure:
             axes = figure.subplots()
             for place, one in enumerate(reversed(shown)):
@@ -192,13 +214,13 @@ class EvaluationTable:
                 axes.plot(value.mean, place, "o", color=SERIES[0], ms=5)
                 if one.paper is not None:
                     axes.plot(one.paper.psnr, place, "o", color=SERIES[1], ms=5, mfc="none")
-            axes.set_yticks(range(len(shown)), [one.row.label for one in reversed(shown)])
+            axes.set_yticks(range(len(shown)), [one.label for one in reversed(shown)])
             axes.set_xlabel("PSNR in the occluded region, dB")
             axes.grid(True, axis="x")
         return figure
 
     def _repr_html_(self) -> str:
-        rows = {one.row.label: one.why or ", ".join(_cell(one.scores, s) for s in self.columns) for one in self.rows}
+        rows = {one.label: one.why or ", ".join(_cell(one.scores, s) for s in self.columns) for one in self.rows}
         return html_of(self.title, rows, self.plot())
 
 
@@ -208,7 +230,7 @@ def folder_name(table: int, obstruction: str, occlusion: str) -> str:
 
 
 class ScoreLine(NamedTuple):
-    """A line of the CSV: a mean with its interval, the mean gain over the proposed row with its own, the paper's."""
+    """A line of the CSV: a mean and its interval, the mean difference to the proposed row and its own, the paper's."""
 
     row: str
     region: str = ""
@@ -225,6 +247,7 @@ class ScoreLine(NamedTuple):
     paper: float | None = None
     parameters: int = 0
     original_parameters: int | None = None
+    run: int = 1
     why_not: str = ""
 
 
@@ -243,8 +266,16 @@ def _size(one: TableRow) -> str:
     return f"   {one.parameters / 1e6:.2f} million weights (original {original})"
 
 
+def _weights(one: TableRow) -> str:
+    """The same in millions, of any network."""
+    if not one.parameters:
+        return ""
+    original = "not stated" if one.original is None else f"{one.original / 1e6:.3g}"
+    return f"{one.parameters / 1e6:.2f}" + (f" ({original})" if one.row.method == "rival" else "")
+
+
 def _escaped(text: str) -> str:
-    return text.replace("&", r"\&").replace("%", r"\%").replace("_", r"\_")
+    return text.replace("&", r"\&").replace("%", r"\%").replace("_", r"\_").replace(" †", r"$^\dagger$")
 
 
 def _paper(paper: PublishedScores | None, region: str, score: str) -> float | None:

@@ -134,6 +134,13 @@ _EVALUATION = {
     "original_parameters": ResultNumber(
         "count", "0 or more", "weights of the original, of a network after a published idea", ""
     ),
+    "run": ResultNumber(
+        "count",
+        "1 or more",
+        "1; 2 and more for rows of later runs that were joined to a table: their gain is to that run's own proposed "
+        "row, whose mean is `mean` less `gain`",
+        "",
+    ),
     "why_not": ResultNumber("text", "a sentence", "why a row could not be computed", ""),
     "pair": ResultNumber("count", "0 or more", "number of a test pair (pairs.csv)", ""),
     "picture": ResultNumber("text", "a file", "its photograph (pairs.csv)", ""),

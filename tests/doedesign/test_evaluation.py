@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import sys
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ from doedesign.evaluation.pairs import PairSet
 from doedesign.evaluation.plates import PlateBanks
 from doedesign.evaluation.published import TABLE_1, TABLE_2
 from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow, rows_of, trainings_of
-from doedesign.evaluation.statistics import bootstrap_mean
+from doedesign.evaluation.statistics import BootstrapInterval, bootstrap_mean
+from doedesign.evaluation.tables import LATER, REGIONS, SCORES, EvaluationTable, TableRow
 from doedesign.evaluation.trainings import TrainingPlan, train_missing
 from doedesign.recon.weights import NETWORK_NAME
 from doedesign.runs.folder import TRAINING_TABLES
@@ -287,6 +288,94 @@ def test_rows_with_fewer_pairs_over_the_full_image_are_those_that_the_page_names
     (said,) = [part for part in page.split("\n\n") if "does not count" in part]
     assert len(counts) == 1
     assert counts <= set(re.findall(r"\d+", said))
+
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "examples" / "results"
+TABLES = sorted(path.stem for path in RESULTS.glob("table?-*.csv"))
+PAGES = {"dirt": "validation-dirt.md", "raindrop": "validation-raindrop.md", "fence": "validation-fence.md"}
+
+
+def lines_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_rows_of_later_runs_are_marked(name: str):
+    """A row's mean less its difference is the proposed row that it was compared with: that of the table, or it is of a
+    later run."""
+    lines = lines_of(RESULTS / f"{name}.csv")
+    proposed = {(one["region"], one["score"]): one for one in lines if one["row"] == "proposed"}
+    found, marked = set(), {one["row"] for one in lines if one["run"] != "1"}
+    for one in lines:
+        own = proposed[one["region"], one["score"]]
+        if one["row"] == "proposed" or one["pairs"] != own["pairs"]:
+            continue  # of fewer pairs another mean
+        # Six digits of each of three numbers.
+        if not one["gain"] or abs(float(one["mean"]) - float(one["gain"]) - float(own["mean"])) > 2e-4:
+            found.add(one["row"])
+    assert found == marked
+    text = (RESULTS / f"{name}.tex").read_text()
+    assert text.count(r"$^\dagger$") == len(marked) + bool(marked)
+
+
+@pytest.mark.parametrize("path", sorted((RESULTS / "later").rglob("*.csv")), ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_rows_that_were_joined_are_those_of_the_later_run(path: Path):
+    table = {(o["row"], o["region"], o["score"]): o for o in lines_of(RESULTS / path.name)}
+    joined = [one for one in lines_of(path) if table[one["row"], one["region"], one["score"]]["run"] != "1"]
+    assert {one["row"] for one in joined} == {
+        "seed1": set(),
+        "robust": {"robust", "robust_fabricated", "robust_untold"},
+        "biharmonic": {"biharmonic_of_capture"},
+    }[path.parent.name]
+    for one in joined:
+        other = table[one["row"], one["region"], one["score"]]
+        assert {key: other[key] for key in one if key != "paper"} == {key: one[key] for key in one if key != "paper"}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_page_has_the_rows_of_the_file(name: str):
+    """All of them, in the order of the file, with its three scores, differences and the paper's numbers."""
+    lines = lines_of(RESULTS / f"{name}.csv")
+    expected = []
+    for row in dict.fromkeys(one["row"] for one in lines):
+        own = {(one["region"], one["score"]): one for one in lines if one["row"] == row}
+        cells = []
+        for score, digits in (("psnr", 2), ("ssim", 3), ("closeness", 3)):
+            inner, whole = (float(own[region, score]["mean"]) for region in ("occluded", "full"))
+            cells.append(f"{inner:.{digits}f} ({whole:.{digits}f})")
+        psnr = own["occluded", "psnr"]
+        mean, low, high = (psnr[key] for key in ("gain", "gain_low", "gain_high"))
+        cells.append(f"{float(mean):+.2f} ({float(low):+.2f} to {float(high):+.2f})" if mean else "")
+        expected.append((psnr["run"] != "1", cells))
+    page = (ROOT / "docs" / PAGES[name.split("-")[1]]).read_text()
+    parts = [part.splitlines() for part in page.split("\n\n")]
+    (table,) = [p for p in parts if len(p) == len(expected) + 2 and f"| {expected[0][1][0]} |" in p[2]]
+    shown = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table[2:]]
+    assert [("†" in cells[0], cells[1:5]) for cells in shown] == expected
+
+
+def test_a_table_says_which_rows_are_of_a_later_run_and_how_many_seeds_it_has():
+    interval = BootstrapInterval(20.0, 19.0, 21.0, 8, 4, 1)
+    scores = {region: dict.fromkeys(SCORES, interval) for region in REGIONS}
+    first, other, _, _, later, *_ = rows_of(2, "dirt", robust=True)
+    rows = (TableRow(first, scores, {}), TableRow(other, scores, scores), TableRow(later, scores, scores, run=2))
+    table = EvaluationTable(2, "dirt", rows, (), {"occlusion": "paper"})
+    found = {one["row"]: one["run"] for one in csv.DictReader(io.StringIO(table.csv()))}
+    assert found == {first.name: "1", other.name: "1", later.name: "2"}
+    for text in (table.text(), table.latex(), caption(table)):
+        assert LATER in text
+    assert table.text().count("†") == 2
+    assert "one seed" in caption(table)
+    alone = replace(table, rows=rows[:2])
+    assert "†" not in alone.text() + alone.latex() + caption(alone)
+    two = {region: dict.fromkeys(SCORES, interval._replace(seeds=2)) for region in REGIONS}
+    assert "photographs and seeds" in caption(replace(alone, rows=(TableRow(first, two, {}),)))
+
+
+def caption(table: EvaluationTable) -> str:
+    drawn: Any = table.plot()
+    return " ".join(drawn.get_supxlabel().split())
 
 
 # Programs of other people.

@@ -1,0 +1,130 @@
+"""Join rows of a later run of `doedesign evaluate` to a table, or draw tables anew from their CSV files.
+
+    python examples/joined_tables.py TABLE.csv [TABLE.csv ...]
+    python examples/joined_tables.py TABLE.csv --later LATER.csv --rows robust robust_fabricated
+
+TABLE is `table.csv` of a run under the name of its folder (table2-dirt-paper.csv). With --later, the rows that --rows
+names are taken from another run's `table.csv`, whatever TABLE has of these names is replaced, and column `run` counts
+on for them: their differences are to the proposed row of their own run, not to that of the table. Written beside TABLE:
+the table itself, LaTeX and the picture, in which such rows have a dagger.
+"""
+
+import argparse
+import csv
+import io
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from doedesign.cli import exit_code
+from doedesign.evaluation.published import TABLE_1, TABLE_2
+from doedesign.evaluation.rows import MethodRow, rows_of
+from doedesign.evaluation.statistics import BootstrapInterval
+from doedesign.evaluation.tables import EvaluationTable, PairFacts, TableRow
+from fab.errors import InputError
+from fab.figure import save
+from fab.files import read_bytes, write_atomic
+
+Lines = list[dict[str, str]]
+
+
+def read_table(path: str | Path) -> EvaluationTable:
+    """Read a table from its CSV file, whose name says of what it is; it knows the number of its pairs, and no pair.
+
+    Args:
+        path: file.
+
+    Raises:
+        InputError: a file of another kind, or a row that no such table has.
+    """
+    kind, _, rest = Path(path).stem.partition("-")
+    obstruction, _, occlusion = rest.rpartition("-")
+    if kind not in ("table1", "table2") or not obstruction:
+        rule, cure = "must be named like table2-dirt-paper.csv", "Rename it after the folder that it came from."
+        raise InputError(str(path), rule, Path(path).name, cure)
+    number = int(kind[-1])
+    found: dict[str, Lines] = {}
+    for line in csv.DictReader(io.StringIO(read_bytes(path).decode())):
+        found.setdefault(line["row"], []).append(line)
+    known = rows_of(number, obstruction, robust=True)
+    if unknown := [name for name in found if name not in {row.name for row in known}]:
+        raise InputError(str(path), "must have rows of the paper's tables alone", unknown[0], "Leave it out.")
+    rows = tuple(_row(row, found[row.name], number, obstruction) for row in known if row.name in found)
+    count = max((int(line["pairs"] or 0) for lines in found.values() for line in lines), default=0)
+    pairs = (PairFacts(0, "", 0.0, 0.0, 0.0),) * count
+    return EvaluationTable(number, obstruction, rows, pairs, {"occlusion": occlusion})
+
+
+def joined(table: EvaluationTable, later: EvaluationTable, names: Sequence[str]) -> EvaluationTable:
+    """Join rows of a later run to a table, in the place of its own of the same names.
+
+    Args:
+        table: the table.
+        later: of the later run.
+        names: of the rows.
+
+    Raises:
+        InputError: a name that the later run has no scores of.
+    """
+    scored = {one.row.name: one for one in later.rows if one.scores}
+    for name in names:
+        if name not in scored:
+            raise InputError("rows", f"must be among {', '.join(scored)}", name, "Choose among these.")
+    run = 1 + max(one.run for one in table.rows if one.row.name not in names)
+    own = {one.row.name: one for one in table.rows} | {name: replace(scored[name], run=run) for name in names}
+    order = [row.name for row in rows_of(table.number, table.obstruction, robust=True)]
+    return replace(table, rows=tuple(own[name] for name in order if name in own))
+
+
+def _row(row: MethodRow, lines: Lines, number: int, obstruction: str) -> TableRow:
+    first, scores, gain = lines[0], {}, {}
+    for line in lines:
+        if not line["region"]:
+            continue
+        scores.setdefault(line["region"], {})[line["score"]] = _interval(line, "mean", "low", "high")
+        if line["gain"]:
+            found = _interval(line, "gain", "gain_low", "gain_high")
+            gain.setdefault(line["region"], {})[line["score"]] = found
+    published: Mapping = TABLE_1 if number == 1 else next((v for k, v in TABLE_2.items() if k in obstruction), {})
+    return TableRow(
+        row,
+        scores,
+        gain,
+        published.get(row.paper) if row.paper else None,
+        first["why_not"],
+        int(first["parameters"] or 0),
+        int(first["original_parameters"]) if first["original_parameters"] else None,
+        int(first.get("run") or 1),
+    )
+
+
+def _interval(line: Mapping[str, str], mean: str, low: str, high: str) -> BootstrapInterval:
+    pairs, pictures, seeds = (int(line[name]) for name in ("pairs", "pictures", "seeds"))
+    return BootstrapInterval(float(line[mean]), float(line[low]), float(line[high]), pairs, pictures, seeds)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Join or draw anew."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("tables", type=Path, nargs="+")
+    parser.add_argument("--later", type=Path)
+    parser.add_argument("--rows", nargs="+", default=[])
+    asked = parser.parse_args(arguments)
+    if asked.later and (len(asked.tables) > 1 or not asked.rows):
+        parser.error("--later takes one table, and --rows with the names of the rows")
+
+    def work() -> None:
+        for path in asked.tables:
+            table = read_table(path)
+            if asked.later:
+                table = joined(table, read_table(asked.later), asked.rows)
+            write_atomic(path, table.csv().encode())
+            write_atomic(path.with_suffix(".tex"), table.latex().encode())
+            save(table.plot(), path.with_suffix(".png"))
+
+    return exit_code(work)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,51 @@
+"""Rows of later runs are joined to a table, and a table is drawn anew from its file alone."""
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "examples" / "results"
+sys.path.insert(0, str(ROOT / "examples"))
+
+import joined_tables  # noqa: E402
+
+NAME = "table2-fence-paper.csv"
+ROBUST = ["robust", "robust_fabricated", "robust_untold"]
+
+
+def test_a_table_comes_back_from_its_file(tmp_path: Path):
+    path = tmp_path / NAME
+    path.write_bytes((RESULTS / NAME).read_bytes())
+    assert joined_tables.main([str(path)]) == 0
+    for name in (NAME, NAME.replace(".csv", ".tex")):
+        assert (tmp_path / name).read_bytes() == (RESULTS / name).read_bytes()
+    assert path.with_suffix(".png").stat().st_size > 0
+
+
+def test_rows_of_a_later_run_are_joined(tmp_path: Path):
+    """One run after the other, as the table that is kept was made."""
+    path = tmp_path / NAME
+    lines = list(csv.DictReader((RESULTS / NAME).read_text().splitlines()))
+    with path.open("w", newline="") as file:
+        table = csv.DictWriter(file, [name for name in lines[0] if name != "run"], lineterminator="\n")
+        table.writeheader()  # as the tables of one run once were, without a column for it
+        table.writerows({k: v for k, v in one.items() if k != "run"} for one in lines if one["run"] == "1")
+    for later, rows in (("robust", ROBUST), ("biharmonic", ["biharmonic_of_capture"])):
+        given = [str(path), "--later", str(RESULTS / "later" / later / NAME), "--rows", *rows]
+        assert joined_tables.main(given) == 0
+    assert path.read_bytes() == (RESULTS / NAME).read_bytes()
+
+
+def test_what_cannot_be_joined_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path, later = tmp_path / NAME, RESULTS / "later" / "biharmonic" / NAME
+    path.write_bytes((RESULTS / NAME).read_bytes())
+    for given, words in (
+        ([str(path), "--later", str(later), "--rows", "robust"], "must be among"),
+        ([str(path), "--later", str(tmp_path / "robust.csv"), "--rows", "robust"], "must be named like"),
+    ):
+        assert joined_tables.main(given) == 2
+        assert words in capsys.readouterr().err
+    assert path.read_bytes() == (RESULTS / NAME).read_bytes()
