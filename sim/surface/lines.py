@@ -4,22 +4,26 @@ A wall adds a line of light to that of thin cells (`sim.rigorous.edge_widths`), 
 border between two cells: where the mask lies, and moved by half of what its openings grew. Up to `masks` walls stand
 side by side there. Each passes the light of the glass on its lower side, in the order in which they stand.
 
-Two walls much nearer to each other than a wavelength act as one of their joint height; far apart each acts for itself.
-Solved rigorously, rows of random cells change from one to the other where walls are about 60 nm apart: of a wall's
-height, the share exp(-(distance / 60 nm)²) is handed on to the next wall. Masks off by up to 0.7 um at random, that is
-right to 2.7 % of the orders (root mean square), where a thin element misses 7 to 18 %.
+Light spreads as it passes the depth of the relief, so walls near to each other share some. In one place two walls are
+one of their joint height; what its light has beyond that of both alone is what they share, and of it `shared_light` is
+left where they stand apart: the ratio of the light that, spread by diffraction over the depth between, crosses both,
+to second order in the phase of the relief. Nothing is fitted. Rigorous solutions of 100 rows of random cells, masks off
+by up to 0.5 um and openings too wide by up to 0.2 um, at 450, 552 and 656 nm and both polarisations: this leaves 0.8 to
+1.1 % of the orders (root mean square; 2.4 % at most), walls that share nothing 4.1 to 5.7 %, a thin element 9 to 11 %.
 
 A line is described by its moments about the border, across it and along it, as a cell is by those of the cell
 (`sim.surface.cell`); its dipole by the first of these.
 """
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
+from numpy.polynomial.chebyshev import chebinterpolate
+from scipy.special import factorial, rgamma
 
 from sim.camera import Camera
 from sim.material import refractive_index
@@ -32,7 +36,7 @@ from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 # Moments kept: degree along the line and across it, and the dipole.
 _DEGREES = tuple((along, across) for along in range(LINE_DEGREE + 1) for across in range(LINE_DEGREE + 1 - along))
 LINE_KINDS = (*_DEGREES, (0, DIPOLE))
-_TOGETHER_M = 60e-9  # distance at which walls act together
+_FARTHEST, _SHARED_TERMS = 3.0, 10  # of `shared_light`: 0.2 % is left there; terms leave 0.1 %
 
 
 class WallNumbers(NamedTuple):
@@ -41,6 +45,7 @@ class WallNumbers(NamedTuple):
     width: Float[np.ndarray, "axis part w term"]  # series, over the pitch
     dipole: Float[np.ndarray, "axis part w 4"]  # over the pitch squared
     foot: Float[np.ndarray, " w"]  # dipole per height of the foot and step of the light, over i and the pitch squared
+    apart: Float[np.ndarray, " w"]  # a cell over sqrt(highest wavelength / pi)
     highest_m: np.float32
 
 
@@ -62,16 +67,45 @@ def wall_numbers(camera: Camera, wavelengths_m: tuple[float, ...], highest_m: fl
         return np.stack([np.real(values), np.imag(values)], 1).astype(np.float32)
 
     foot = np.array(wavelengths_m) / np.array(index) / (4 * np.pi * pitch**2)
-    return WallNumbers(parts(width), parts(dipole), foot.astype(np.float32), np.float32(highest_m))
+    apart = pitch * np.sqrt(np.pi / (highest_m * np.array(wavelengths_m)))
+    return WallNumbers(
+        parts(width), parts(dipole), foot.astype(np.float32), apart.astype(np.float32), np.float32(highest_m)
+    )
 
 
-class _Wall(NamedTuple):
-    """A wall that the next may still join, `[cell]` each: what is left of its height, its place, and the glass."""
+def shared_light(distance: Any) -> tuple[Any, Any]:
+    """Part of the light shared by two walls of one height that is left where they stand apart.
 
-    rise_m: Array
-    across: Array  # place across the border, cells
-    along: Array  # displacement along itself, cells
-    height_m: Array  # of the glass behind it
+    Their light spreads by diffraction. To second order in the phase, what crosses both is an integral of
+    (height - z) f(z) over the depth z between the crossings, f(z) = E[max(x - d, 0)] for walls at a distance d and x of
+    the normal distribution of variance i z wavelength / (2 pi). That is the fifth repeated integral of the
+    complementary error function (Abramowitz and Stegun, 7.2) at exp(-i pi / 4) times the distance in the units below.
+
+    Args:
+        distance: of the walls over sqrt(height wavelength / pi); not negative. Beyond 3, 0.2 % stand for less.
+
+    Returns:
+        real and imaginary part, 1 and 0 where the walls are one, to 0.001.
+    """
+    place = jnp.minimum(distance, _FARTHEST) * (2 / _FARTHEST) - 1
+    real, imaginary = (series_at(series, place) for series in _shared_series())
+    return real, imaginary
+
+
+@lru_cache(maxsize=1)
+def _shared_series() -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Chebyshev series of real and imaginary part, from the power series of the integral."""
+    k = np.arange(90)
+    of = (-2.0) ** k * rgamma(3.5 - k / 2) / (factorial(k) * rgamma(3.5))
+
+    def exact(place: Float[np.ndarray, " node"]) -> Complex[np.ndarray, " node"]:
+        return (np.exp(-0.25j * np.pi) * _FARTHEST / 2 * (place[:, None] + 1)) ** k @ of
+
+    real, imaginary = (
+        tuple(chebinterpolate(lambda place, part=part: part(exact(place)), _SHARED_TERMS - 1).tolist())
+        for part in (np.real, np.imag)
+    )
+    return real, imaginary
 
 
 def line_moments(
@@ -114,43 +148,108 @@ def line_moments(
         # The lower side of an opening moves down as it grows.
         at = place[:, axis, None] - bias[:, None] * jnp.sign(opens)
         rise, along = -relief.depth_m[:, None] * opens * uniform, jnp.broadcast_to(place[:, 1 - axis, None], at.shape)
-        walls = _sorted(at, rise, along)
-
-        def light(wall: _Wall) -> tuple[Array, Array]:
-            """Line and dipole, `[2, w, cell]` each."""
-            lower = wall.height_m - jnp.maximum(wall.rise_m, 0.0)
-            height = jnp.abs(wall.rise_m)
-            size = height / numbers.highest_m
-            terms = jnp.moveaxis(numbers.width[axis], -1, 0)[..., None]  # [term, part, w, 1]
-            own = Pair(*(series_at(terms, 2 * size - 1) * (size * plan.parts)))
-            low, high = (Pair(*light_of(at[None], rates)[0]) for at in (lower, lower + height))
-            a, b, c, d = jnp.moveaxis(numbers.dipole[axis], -1, 0)[..., None]  # [part, w, 1]
-            foot = numbers.foot[:, None] * (lower - relief.height_m / 2)  # the plane is halfway up the relief
-            near, far = height * (a + b * height), height * (c + d * height)
-            dipole = low.times(Pair(near[0], near[1] - foot)).plus(high.times(Pair(far[0], far[1] + foot)))
-            return jnp.stack(low.times(own)), jnp.stack(dipole) * (jnp.sign(wall.rise_m) * plan.parts**2)
-
-        def moments(wall: _Wall, amount: Array | float) -> Array:
-            lit, dipole = (part * amount for part in light(wall))
-            along, at = wall.along * plan.parts, wall.across * plan.parts
-            # Of the Legendre polynomials over a wall that is displaced as a whole.
-            displaced = (1.0, 2 * along, 6 * along**2)
-            return jnp.stack([*(lit * (displaced[a] * at**b) for a, b in _DEGREES), dipole])
-
-        def meet(last: tuple[_Wall, Array], next_wall: tuple[Array, ...]) -> tuple[tuple[_Wall, Array], None]:
-            (wall, total), (at, rise, along) = last, next_wall
-            stands = rise != 0
-            joint = jnp.exp(-(((at - wall.across) * (pitch / _TOGETHER_M)) ** 2))
-            total = total + moments(wall, jnp.where(stands, 1 - joint, 0.0))
-            met = _Wall(rise + joint * wall.rise_m, at, along, wall.height_m + rise)
-            return (_Wall(*(jnp.where(stands, new, old) for new, old in zip(met, wall, strict=True))), total), None
-
-        none = jnp.zeros_like(height)
-        empty = jnp.zeros((len(LINE_KINDS), 2, len(rates), len(none)))
-        (wall, total), _ = jax.lax.scan(meet, (_Wall(none, none, none, height), empty), walls)
-        return total + moments(wall, 1.0)
+        at, rise, along = _sorted(at, rise, along)
+        heights = jnp.concatenate([height[None], height + jnp.cumsum(rise, 0)])
+        # Loops keep the compiler from computing their values anew wherever one is read.
+        ends = (*_ends(heights, 1), *_ends(light_of(heights, rates), 1))
+        joined = jax.lax.map(lambda of: _as_one_wall(*of, axis, relief), ends)
+        several = (*_ends(heights[:-1], 1), *_ends(heights[1:], 1), *_ends(at, 1))
+        left = jax.lax.map(lambda of: _left(*of, numbers), several)
+        shared = [_shared(one, left, plan.masks) for one in joined]
+        return _moments(shared, *(sum(_ends(of, 0)) * (plan.parts / 2) for of in (along, at)), plan.parts)
 
     return jnp.stack([across(0), across(1)])
+
+
+def _ends(of: Float[Array, "n ..."], fewest: int) -> tuple[Float[Array, "group ..."], Float[Array, "group ..."]]:
+    """Values at either end of all groups of neighbours that are so many places apart: at first the fewest, then more.
+
+    Groups of walls, from one on, are those of the heights between them, from two on.
+    """
+    apart = range(fewest, len(of))
+    first, last = [of[: len(of) - count] for count in apart], [of[count:] for count in apart]
+    return (jnp.concatenate(first), jnp.concatenate(last)) if apart else (of[:0], of[:0])
+
+
+def _as_one_wall(
+    before_m: Float[Array, " cell"],
+    behind_m: Float[Array, " cell"],
+    before: Float[Array, "2 w cell"],
+    behind: Float[Array, "2 w cell"],
+    axis: int,
+    relief: EtchParameters,
+) -> tuple[Pair, Pair]:
+    """Line and dipole, `[w, cell]` each, of a wall between glass of two heights whose light is given."""
+    assert relief.walls is not None
+    numbers, rise = relief.walls, behind_m - before_m
+    height, rises, foot_m = jnp.abs(rise), rise > 0, jnp.minimum(before_m, behind_m)
+    lower, higher = (
+        Pair(*(jnp.where(rises, one[part], other[part]) for part in (0, 1)))
+        for one, other in ((before, behind), (behind, before))
+    )
+    size = height / numbers.highest_m
+    terms = jnp.moveaxis(numbers.width[axis], -1, 0)[..., None]  # [term, part, w, 1]
+    width = Pair(*(series_at(terms[:, part], 2 * size - 1) * size for part in (0, 1)))
+    a, b, c, d = (Pair(*of) for of in jnp.moveaxis(numbers.dipole[axis], -1, 0)[..., None])  # [w, 1]
+    near, far = (Pair(*(rise * (one + height * two) for one, two in zip(*of, strict=True))) for of in ((a, b), (c, d)))
+    # Light is told halfway up the relief.
+    step = Pair(jnp.zeros_like(rise), jnp.sign(rise) * numbers.foot[:, None] * (foot_m - relief.height_m / 2))
+    return lower.times(width), lower.times(near.plus(step, -1.0)).plus(higher.times(far.plus(step)))
+
+
+def _left(
+    first_before_m: Float[Array, " cell"],
+    last_before_m: Float[Array, " cell"],
+    first_behind_m: Float[Array, " cell"],
+    last_behind_m: Float[Array, " cell"],
+    first_at: Float[Array, " cell"],
+    last_at: Float[Array, " cell"],
+    numbers: WallNumbers,
+) -> Pair:
+    """Part of the light shared by the first and the last of several walls that is left, `[w, cell]`."""
+    a, b, c, d = (of / numbers.highest_m for of in (first_before_m, first_behind_m, last_before_m, last_behind_m))
+
+    def power(depth: Array) -> Array:
+        depth = jnp.abs(depth)
+        return depth**2 * jnp.sqrt(depth + 1e-9)  # 5 / 2, with a slope at 0
+
+    # The mean root of the depth between two layers, over that of a layer within itself: 8 / 15 of its height's root.
+    sums = power(d - a) + power(c - b) - power(d - b) - power(c - a)
+    root = jnp.maximum(jnp.abs(sums), 1e-12) / 2
+    return Pair(*shared_light((last_at - first_at) * jnp.abs((b - a) * (d - c)) / root * numbers.apart[:, None]))
+
+
+def _shared(whole: Pair, left: Pair, walls: int) -> Pair:
+    """Light of single walls, and what is left of that which groups share beyond any smaller ones."""
+
+    def beyond(whole: Array) -> tuple[Array, Array]:
+        sizes = np.arange(walls, 0, -1)
+        single, *several = jnp.split(whole, np.cumsum(sizes)[:-1])
+        smaller, shared = [jnp.zeros_like(whole[: walls + 1]), single], []
+        for one in several:
+            shared.append(one - smaller[-1][:-1] - smaller[-1][1:] + smaller[-2][1:-1])
+            smaller.append(one)
+        return single, jnp.concatenate([single[:0], *shared])
+
+    single, several = zip(*(beyond(part) for part in whole), strict=True)
+    kept = Pair(*several).times(left)
+    return Pair(*(jnp.concatenate(of) for of in zip(single, kept, strict=True)))
+
+
+def _moments(
+    light: list[Pair], along: Float[Array, "group cell"], at: Float[Array, "group cell"], parts: int
+) -> Float[Array, "kind 2 w cell"]:
+    """Sums over groups of the moments of lines and dipoles that are displaced along the border and across it."""
+
+    def add(total: tuple[Pair, ...], group: tuple[Pair, Pair, Array, Array]) -> tuple[tuple[Pair, ...], None]:
+        line, dipole, along, at = group
+        displaced = (1.0, 2 * along, 6 * along**2)  # Legendre polynomials over a line
+        lines = [one.plus(line, parts * displaced[a] * at**b) for one, (a, b) in zip(total, _DEGREES, strict=False)]
+        return (*lines, total[-1].plus(dipole, parts**2)), None
+
+    none = jnp.zeros_like(light[0].real[0])
+    total, _ = jax.lax.scan(add, (Pair(none, none),) * len(LINE_KINDS), (*light, along, at))
+    return jnp.stack([jnp.stack(one) for one in total])
 
 
 def _sorted(key: Float[Array, "n cell"], *others: Float[Array, "n cell"]) -> tuple[Float[Array, "n cell"], ...]:
