@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from numpy.polynomial.chebyshev import chebinterpolate
+from numpy.polynomial.chebyshev import chebfit, chebpts1
 from scipy.special import factorial, rgamma
 
 from sim.camera import Camera
@@ -95,17 +95,11 @@ def shared_light(distance: Any) -> tuple[Any, Any]:
 @lru_cache(maxsize=1)
 def _shared_series() -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Chebyshev series of real and imaginary part, from the power series of the integral."""
-    k = np.arange(90)
+    k, place = np.arange(90), chebpts1(64)
     of = (-2.0) ** k * rgamma(3.5 - k / 2) / (factorial(k) * rgamma(3.5))
-
-    def exact(place: Float[np.ndarray, " node"]) -> Complex[np.ndarray, " node"]:
-        return (np.exp(-0.25j * np.pi) * _FARTHEST / 2 * (place[:, None] + 1)) ** k @ of
-
-    real, imaginary = (
-        tuple(chebinterpolate(lambda place, part=part: part(exact(place)), _SHARED_TERMS - 1).tolist())
-        for part in (np.real, np.imag)
-    )
-    return real, imaginary
+    exact = (np.exp(-0.25j * np.pi) * _FARTHEST / 2 * (place[:, None] + 1)) ** k @ of
+    series = chebfit(place, exact, _SHARED_TERMS - 1)
+    return tuple(np.real(series).tolist()), tuple(np.imag(series).tolist())
 
 
 def line_moments(
@@ -150,13 +144,16 @@ def line_moments(
         rise, along = -relief.depth_m[:, None] * opens * uniform, jnp.broadcast_to(place[:, 1 - axis, None], at.shape)
         at, rise, along = _sorted(at, rise, along)
         heights = jnp.concatenate([height[None], height + jnp.cumsum(rise, 0)])
+        (before_m, behind_m), (before, behind) = _ends(heights, 1), _ends(light_of(heights, rates), 1)
+        sides = _Side(before_m, before), _Side(behind_m, behind)
+        first, last = (_Wall(*of) for of in zip(*(_ends(of, 1) for of in (heights[:-1], heights[1:], at)), strict=True))
         # Loops keep the compiler from computing their values anew wherever one is read.
-        ends = (*_ends(heights, 1), *_ends(light_of(heights, rates), 1))
-        joined = jax.lax.map(lambda of: _as_one_wall(*of, axis, relief), ends)
-        several = (*_ends(heights[:-1], 1), *_ends(heights[1:], 1), *_ends(at, 1))
-        left = jax.lax.map(lambda of: _left(*of, numbers), several)
-        shared = [_shared(one, left, plan.masks) for one in joined]
-        return _moments(shared, *(sum(_ends(of, 0)) * (plan.parts / 2) for of in (along, at)), plan.parts)
+        joined = jax.lax.map(lambda of: _as_one_wall(of[0], of[1], axis, relief), sides)
+        left = jax.lax.map(lambda of: _left(of[0], of[1], numbers), (first, last))
+        line, dipole = (_shared(one, left, plan.masks) for one in joined)
+        # What several share is in the middle between the first and the last.
+        middle_along, middle = (jnp.add(*_ends(of, 0)) * (plan.parts / 2) for of in (along, at))
+        return _moments(line, dipole, middle_along, middle, plan.parts)
 
     return jnp.stack([across(0), across(1)])
 
@@ -171,21 +168,29 @@ def _ends(of: Float[Array, "n ..."], fewest: int) -> tuple[Float[Array, "group .
     return (jnp.concatenate(first), jnp.concatenate(last)) if apart else (of[:0], of[:0])
 
 
-def _as_one_wall(
-    before_m: Float[Array, " cell"],
-    behind_m: Float[Array, " cell"],
-    before: Float[Array, "2 w cell"],
-    behind: Float[Array, "2 w cell"],
-    axis: int,
-    relief: EtchParameters,
-) -> tuple[Pair, Pair]:
-    """Line and dipole, `[w, cell]` each, of a wall between glass of two heights whose light is given."""
+class _Side(NamedTuple):
+    """Glass on one side of a wall."""
+
+    height_m: Array  # `[cell]`
+    light: Array  # `[2, w, cell]`
+
+
+class _Wall(NamedTuple):
+    """Heights before and behind a wall, and its place across the border in cells, `[cell]` each."""
+
+    before_m: Array
+    behind_m: Array
+    at: Array
+
+
+def _as_one_wall(before: _Side, behind: _Side, axis: int, relief: EtchParameters) -> tuple[Pair, Pair]:
+    """Line and dipole, `[w, cell]` each, of a wall between two sides."""
     assert relief.walls is not None
-    numbers, rise = relief.walls, behind_m - before_m
-    height, rises, foot_m = jnp.abs(rise), rise > 0, jnp.minimum(before_m, behind_m)
+    numbers, rise = relief.walls, behind.height_m - before.height_m
+    height, rises, foot_m = jnp.abs(rise), rise > 0, jnp.minimum(before.height_m, behind.height_m)
     lower, higher = (
         Pair(*(jnp.where(rises, one[part], other[part]) for part in (0, 1)))
-        for one, other in ((before, behind), (behind, before))
+        for one, other in ((before.light, behind.light), (behind.light, before.light))
     )
     size = height / numbers.highest_m
     terms = jnp.moveaxis(numbers.width[axis], -1, 0)[..., None]  # [term, part, w, 1]
@@ -197,17 +202,9 @@ def _as_one_wall(
     return lower.times(width), lower.times(near.plus(step, -1.0)).plus(higher.times(far.plus(step)))
 
 
-def _left(
-    first_before_m: Float[Array, " cell"],
-    last_before_m: Float[Array, " cell"],
-    first_behind_m: Float[Array, " cell"],
-    last_behind_m: Float[Array, " cell"],
-    first_at: Float[Array, " cell"],
-    last_at: Float[Array, " cell"],
-    numbers: WallNumbers,
-) -> Pair:
-    """Part of the light shared by the first and the last of several walls that is left, `[w, cell]`."""
-    a, b, c, d = (of / numbers.highest_m for of in (first_before_m, first_behind_m, last_before_m, last_behind_m))
+def _left(first: _Wall, last: _Wall, numbers: WallNumbers) -> Pair:
+    """Part of the light that two walls share that is left, `[w, cell]`."""
+    a, b, c, d = (of / numbers.highest_m for of in (*first[:2], *last[:2]))
 
     def power(depth: Array) -> Array:
         depth = jnp.abs(depth)
@@ -216,7 +213,7 @@ def _left(
     # The mean root of the depth between two layers, over that of a layer within itself: 8 / 15 of its height's root.
     sums = power(d - a) + power(c - b) - power(d - b) - power(c - a)
     root = jnp.maximum(jnp.abs(sums), 1e-12) / 2
-    return Pair(*shared_light((last_at - first_at) * jnp.abs((b - a) * (d - c)) / root * numbers.apart[:, None]))
+    return Pair(*shared_light((last.at - first.at) * jnp.abs((b - a) * (d - c)) / root * numbers.apart[:, None]))
 
 
 def _shared(whole: Pair, left: Pair, walls: int) -> Pair:
@@ -237,18 +234,18 @@ def _shared(whole: Pair, left: Pair, walls: int) -> Pair:
 
 
 def _moments(
-    light: list[Pair], along: Float[Array, "group cell"], at: Float[Array, "group cell"], parts: int
+    line: Pair, dipole: Pair, along: Float[Array, "group cell"], at: Float[Array, "group cell"], parts: int
 ) -> Float[Array, "kind 2 w cell"]:
     """Sums over groups of the moments of lines and dipoles that are displaced along the border and across it."""
 
-    def add(total: tuple[Pair, ...], group: tuple[Pair, Pair, Array, Array]) -> tuple[tuple[Pair, ...], None]:
+    def add(total: list[Pair], group: tuple[Pair, Pair, Array, Array]) -> tuple[list[Pair], None]:
         line, dipole, along, at = group
         displaced = (1.0, 2 * along, 6 * along**2)  # Legendre polynomials over a line
         lines = [one.plus(line, parts * displaced[a] * at**b) for one, (a, b) in zip(total, _DEGREES, strict=False)]
-        return (*lines, total[-1].plus(dipole, parts**2)), None
+        return [*lines, total[-1].plus(dipole, parts**2)], None
 
-    none = jnp.zeros_like(light[0].real[0])
-    total, _ = jax.lax.scan(add, (Pair(none, none),) * len(LINE_KINDS), (*light, along, at))
+    none = jnp.zeros_like(line.real[0])
+    total, _ = jax.lax.scan(add, [Pair(none, none) for _ in LINE_KINDS], (line, dipole, along, at))
     return jnp.stack([jnp.stack(one) for one in total])
 
 

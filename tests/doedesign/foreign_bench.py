@@ -216,7 +216,9 @@ def _left(apart_m: float, heights: tuple[np.ndarray, ...], wavelength_m: float) 
 
     a, b, c, d = heights
     ends = ((d - a, 1), (c - b, 1), (d - b, -1), (c - a, -1))
-    apart, joint = (sum(sign * of(np.sqrt(np.abs(depth))) for depth, sign in ends) for of in map(twice, (apart_m, 0.0)))
+    apart, joint = (
+        np.sum([sign * of(np.sqrt(np.abs(depth))) for depth, sign in ends], axis=0) for of in map(twice, (apart_m, 0.0))
+    )
     return apart / joint
 
 
