@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from doedesign.cli import exit_code
-from doedesign.evaluation.published import TABLE_1, TABLE_2
+from doedesign.evaluation.published import published_scores
 from doedesign.evaluation.rows import MethodRow, rows_of
 from doedesign.evaluation.statistics import BootstrapInterval
 from doedesign.evaluation.tables import EvaluationTable, PairFacts, TableRow
@@ -86,7 +86,7 @@ def _row(row: MethodRow, lines: Lines, number: int, obstruction: str) -> TableRo
         if line["gain"]:
             found = _interval(line, "gain", "gain_low", "gain_high")
             gain.setdefault(line["region"], {})[line["score"]] = found
-    published: Mapping = TABLE_1 if number == 1 else next((v for k, v in TABLE_2.items() if k in obstruction), {})
+    published = published_scores(number, obstruction)
     return TableRow(
         row,
         scores,

@@ -72,3 +72,15 @@ TABLE_2: Mapping[str, Mapping[str, PublishedScores]] = MappingProxyType(
     }
 )
 """By obstruction; "fence" through the DSLR lens, the others before the windshield camera."""
+
+
+def published_scores(table: int, obstruction: str) -> Mapping[str, PublishedScores]:
+    """The paper's scores by row.
+
+    Args:
+        table: 1 or 2.
+        obstruction: kind of obstruction; nothing for one that Table 2 has no column of.
+    """
+    if table == 1:
+        return TABLE_1
+    return next((rows for kind, rows in TABLE_2.items() if kind in obstruction), {})

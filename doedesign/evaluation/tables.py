@@ -9,7 +9,7 @@ import numpy as np
 
 from doedesign.capture.from_spec import rgb_from_channels
 from doedesign.evaluation.candidates import Candidate, Unscored
-from doedesign.evaluation.published import TABLE_1, TABLE_2, PublishedScores
+from doedesign.evaluation.published import PublishedScores, published_scores
 from doedesign.evaluation.rivals.layers import count_of
 from doedesign.evaluation.rivals.registry import RIVALS
 from doedesign.evaluation.rows import MethodRow
@@ -302,7 +302,7 @@ def table_of(
         left: rows without scores.
         study: what scores depend on.
     """
-    published = TABLE_1 if number == 1 else next((v for k, v in TABLE_2.items() if k in obstruction), {})
+    published = published_scores(number, obstruction)
     names = [p.picture for p in pairs]
     by_row: dict[str, list[Candidate]] = {}
     for one in candidates:
