@@ -32,6 +32,7 @@ from sim.camera import Camera
 from sim.material import refractive_index
 from sim.optic import HeightOptic, ViewedOptic
 from sim.propagation.oblique import oblique_waves
+from sim.rigorous.corner_light import corner_unit
 from sim.rigorous.walls import Walls, light_of_cells_and_walls
 from sim.rigorous.width_tables import edge_table, highest_wall, two_waves
 from sim.source import SeparableSource, SourceMap, View
@@ -148,7 +149,9 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
             table = edge_table(highest, wavelength, index, camera.polarisation, axis)
             own = _at_borders(taps[0], camera, axis), _at_borders(taps[1], camera, axis)
             walls.append(Walls.of(table, highest, index / wavelength, own, camera.grid.pitch_m))
-        found.append(light_of_cells_and_walls(height, camera.waves_per_metre(wavelength), *walls))
+        rate = camera.waves_per_metre(wavelength)
+        corner = corner_unit(wavelength, index) / camera.grid.pitch_m**2
+        found.append(light_of_cells_and_walls(height, rate, corner, *walls))
     coverage = jnp.asarray(open_cells(camera.grid, camera.opening))
     return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), tuple(views), wavelengths, depths)
 

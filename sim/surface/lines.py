@@ -13,7 +13,8 @@ of them at 450 and 656 nm, the sum over walls leaves 0.8 to 1.1 % of the orders 
 that share nothing 4.1 to 5.7 %, a thin element 9 to 11 %.
 
 A line is described by its moments about the border, across it and along it, as a cell is by those of the cell
-(`sim.surface.cell`); its dipole by the first of these.
+(`sim.surface.cell`); its dipole by the first of these. Where borders of both axes meet is the light of a corner
+(`sim.rigorous.corner_light`), that of the four cells as if their masks lay together, at the mean of where these do.
 """
 
 from functools import lru_cache
@@ -28,6 +29,7 @@ from scipy.special import factorial, rgamma
 
 from sim.camera import Camera
 from sim.material import refractive_index
+from sim.rigorous.corner_light import CornerCell, corner_light, corner_unit
 from sim.rigorous.edge_widths import series_at
 from sim.rigorous.width_tables import edge_table
 from sim.surface.cell import DIPOLE, LINE_DEGREE
@@ -48,6 +50,7 @@ class WallNumbers(NamedTuple):
     foot: Float[np.ndarray, " w"]  # dipole per height of the foot and step of the light, over i and the pitch squared
     apart: Float[np.ndarray, " w"]  # a cell over sqrt(highest wavelength / pi)
     highest_m: np.float32
+    corner: Float[np.ndarray, " w"]  # unit of the light of corners, over the pitch squared
 
 
 @lru_cache(maxsize=16)
@@ -69,9 +72,9 @@ def wall_numbers(camera: Camera, wavelengths_m: tuple[float, ...], highest_m: fl
 
     foot = np.array(wavelengths_m) / np.array(index) / (4 * np.pi * pitch**2)
     apart = pitch * np.sqrt(np.pi / (highest_m * np.array(wavelengths_m)))
-    return WallNumbers(
-        parts(width), parts(dipole), foot.astype(np.float32), apart.astype(np.float32), np.float32(highest_m)
-    )
+    corner = np.array([corner_unit(*of) for of in zip(wavelengths_m, index, strict=True)]) / pitch**2
+    foot, apart, corner = (of.astype(np.float32) for of in (foot, apart, corner))
+    return WallNumbers(parts(width), parts(dipole), foot, apart, np.float32(highest_m), corner)
 
 
 def shared_light(distance: Any) -> tuple[Any, Any]:
@@ -112,8 +115,10 @@ def line_moments(
     relief: EtchParameters,
     rates: Float[Array, " w"],
     plan: TilePlan,
-) -> Float[Array, "axis kind 2 w cell"]:
+) -> Float[Array, "3 kind 2 w cell"]:
     """Moments of the lines at the lower borders of a tile's cells, across y and across x, for `LINE_KINDS`.
+
+    Then those of the points where these borders meet, as parts of lines across y that are no longer than they.
 
     Args:
         states: open share of every mask's pixels, with a halo.
@@ -157,7 +162,36 @@ def line_moments(
         middle_along, middle = (jnp.add(*_ends(of, 0)) * (plan.parts / 2) for of in (along, at))
         return _moments(line, dipole, middle_along, middle, plan.parts)
 
-    return jnp.stack([across(0), across(1)])
+    def points() -> Array:
+        def pixels(mask: Array) -> Array:
+            start = plan.reach - 1 - whole[mask]
+            return jax.lax.dynamic_slice(states, (mask, start[0], start[1]), (1, TILE + 1, TILE + 1))[0]
+
+        seen = jax.lax.map(pixels, jnp.arange(plan.masks))
+        near, rough = (_with_one_before(jnp.asarray(of)) if jnp.ndim(of) else of for of in (uniform, bump))
+        height = relief.height_m + rough - jnp.tensordot(relief.depth_m, seen, 1) * near
+        light = jax.lax.map(lambda rate: light_of(height.reshape(1, -1), rate[None])[0, :, 0], rates)
+        light = light.reshape(-1, 2, TILE + 1, TILE + 1)
+
+        def cell(y: int, x: int) -> CornerCell:
+            def own(of: Array) -> Array:
+                return of[..., y : y + TILE, x : x + TILE].reshape(*of.shape[:-2], -1)
+
+            return CornerCell(2 * np.pi * rates[:, None] * own(height), own(light[:, 0]), own(light[:, 1]))
+
+        found = corner_light((cell(0, 0), cell(0, 1), cell(1, 0), cell(1, 1)))
+        real, imaginary = (part * numbers.corner[:, None] * plan.parts**2 for part in found)
+        at, along = jnp.dot(relief.depth_m, place) / jnp.sum(relief.depth_m) * plan.parts
+        displaced = (jnp.ones(()), 2 * along - 1, 6 * along * (along - 1) + 1)  # Legendre polynomials, from -1/2 on
+        factors = jnp.stack([*(displaced[a] * at**b for a, b in _DEGREES), jnp.zeros(())])
+        return factors[:, None, None, None] * jnp.stack([real, imaginary])
+
+    return jnp.stack([across(0), across(1), points()])
+
+
+def _with_one_before(of: Float[Array, " cell"]) -> Float[Array, "side side"]:
+    """A tile with a row and a column before it that are like its first."""
+    return jnp.pad(of.reshape(TILE, TILE), ((1, 0), (1, 0)), mode="edge")
 
 
 def _ends(of: Float[Array, "n ..."], fewest: int) -> tuple[Float[Array, "group ..."], Float[Array, "group ..."]]:

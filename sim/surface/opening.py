@@ -32,13 +32,13 @@ class Opening(NamedTuple):
 
 def through_opening(
     moments: Float[Array, "m 2 w t t"],
-    lines: Float[Array, "axis kind 2 w t t"],
+    lines: Float[Array, "3 kind 2 w t t"],
     light: Float[Array, "piece 2 w cell"],
     along: tuple[Cuts, Cuts],
     opening: Opening,
     start: tuple[Array, Array],
     plan: TilePlan,
-) -> tuple[Float[Array, "m 2 w t t"], Float[Array, "axis kind 2 w t t"]]:
+) -> tuple[Float[Array, "m 2 w t t"], Float[Array, "3 kind 2 w t t"]]:
     """Moments of one tile's cells, and of lines, behind the chrome.
 
     `light` is that of the pieces into which the cells are cut `along` y and x; `start` is the tile's first cell (y, x).

@@ -157,7 +157,7 @@ def _tile_moments(
     start: tuple[Array, Array],
     rates: Float[Array, " w"],
     plan: TilePlan,
-) -> tuple[Float[Array, "moment 2 w t t"], Float[Array, "axis kind 2 w t t"], Float[Array, "w 2 s s"]]:
+) -> tuple[Float[Array, "moment 2 w t t"], Float[Array, "3 kind 2 w t t"], Float[Array, "w 2 s s"]]:
     """Moments of the transmission of one tile's cells (`sim.surface.cell.plane_moments` says which), and of lines.
 
     Then the mean of every part of the cells, without the chrome.
@@ -198,7 +198,7 @@ def _tile_moments(
         moments = moments + walls(light, depth, along_y, along_x, relief, rates, plan)
     if shares is not None and plan.corners:
         moments = moments + corners(light, shares > 0, along_y, along_x, relief, rates, plan)
-    lines = jnp.zeros((2, 0, *moments.shape[1:]))
+    lines = jnp.zeros((3, 0, *moments.shape[1:]))
     if plan.lines:
         lines = line_moments(states, uniform, 0.0 if bump is None else bump.reshape(-1), shift, relief, rates, plan)
     moments, lines = (part.reshape(*part.shape[:-1], tile, tile) for part in (moments, lines))
@@ -219,7 +219,7 @@ def _line_kinds(along: int) -> list[int]:
 
 def _tile_rows(
     moments: Float[Array, "m 2 w t t"],
-    lines: Float[Array, "axis line 2 w t t"],
+    lines: Float[Array, "3 line 2 w t t"],
     along_x: Float[Array, "view part kind s wide"],
     plan: TilePlan,
 ) -> Float[Array, "view row 2 v u"]:
@@ -230,7 +230,8 @@ def _tile_rows(
     values = _by_place(moments, plan)
     if not plan.cut:
         return values[:1, jnp.array([number for number, _ in plan.views])].swapaxes(0, 1)
-    across_y, across_x = (_line_values(lines[axis], axis, plan) for axis in (0, 1))
+    both = [_on_parts(of, across, plan) for of, across in zip(lines, ((0,), (1,), (0, 1)), strict=True)]
+    across_y, across_x = (dict(zip(LINE_KINDS, of, strict=False)) for of in (both[0] + both[2], both[1]))
 
     def spread(first: Array, higher: list[Array], weights: Array) -> Array:
         """Values of cells that look like moments along x: those of degree 0, and others with their weights."""
@@ -264,18 +265,20 @@ def _by_place(moments: Float[Array, "m 2 w t t"], plan: TilePlan) -> Float[Array
     return jnp.transpose(moments, (2, 4, 3, 5, 0, 6, 1)).reshape(-1, count, 2, size, size)
 
 
-def _line_values(
-    lines: Float[Array, "line 2 w t t"], axis: int, plan: TilePlan
-) -> dict[tuple[int, int], Float[Array, "w 2 s s"]]:
-    """Moments of lines across an axis (0 or 1), by degree along and across the line, on the parts of the cells."""
+def _on_parts(
+    lines: Float[Array, "line 2 w t t"], across: tuple[int, ...], plan: TilePlan
+) -> Float[Array, "line w 2 s s"]:
+    """Moments of lines across an axis (0 or 1) on the parts of cells; across both they are points.
+
+    A line lies on the lower border of its cell's first part, and along all of them.
+    """
     found = jnp.swapaxes(lines, 1, 2)
-    if plan.parts > 1:
-        # A line lies on the lower border of its cell's first part, and along all of them.
-        found = jnp.repeat(found, plan.parts, axis=-1 - axis)
-        between = np.zeros(plan.parts, np.float32)
-        between[0] = 1
-        found = jnp.moveaxis(jnp.kron(jnp.moveaxis(found, axis - 2, -1), between), -1, axis - 2)
-    return dict(zip(LINE_KINDS, found, strict=False))
+    for axis in range(2) if plan.parts > 1 else ():
+        found = jnp.repeat(found, plan.parts, axis=axis - 2)
+        if axis in across:
+            first = jnp.arange(found.shape[axis - 2]) % plan.parts == 0
+            found = jnp.where(first[:, None] if axis == 0 else first, found, 0.0)
+    return found
 
 
 def _strip_values(

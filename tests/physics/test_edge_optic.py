@@ -1,4 +1,4 @@
-"""PSFs with the light of walls, against sums over cells and walls written out, and against coupled waves."""
+"""PSFs with the light of walls, against sums over cells, walls and corners written out, and against coupled waves."""
 
 from dataclasses import replace
 
@@ -16,6 +16,7 @@ from sim.material import refractive_index
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.rigorous import compare_row, edge_widths
+from sim.rigorous.corner_light import corner_unit
 from sim.rigorous.edge_optic import dipole_weights, line_weights, optic_as_drawn, with_edges
 from sim.rigorous.edge_widths import edge_dipoles, series_at
 from sim.rigorous.rows import Polarisation
@@ -36,15 +37,30 @@ def levels(cells: int, seed: int = 0) -> np.ndarray:
     return STEP * np.random.default_rng(seed).integers(0, 16, (cells, cells))
 
 
+def of_corners(phase: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Light of all corners of a map over that of `corner_unit`: its formula, cell by cell of the four."""
+    found = np.zeros(np.subtract(phase.shape, 1), complex)
+    for y in (0, 1):
+        for x in (0, 1):
+
+            def at(of: np.ndarray, y: int, x: int) -> np.ndarray:
+                return of[y : y + len(of) - 1, x : x + of.shape[1] - 1]
+
+            u, v, w = (at(phase, *place) - at(phase, y, x) for place in ((y, 1 - x), (1 - y, x), (1 - y, 1 - x)))
+            second = 2 * (np.sign(u) + np.sign(v) - np.sign(w)) + 1j * (np.abs(u) + np.abs(v) - np.abs(w))
+            found += at(light, y, x) * (second / (2 * np.pi) + u * v * (0.0018 * w * np.abs(w) - 0.021j))
+    return found
+
+
 def written_out(
-    height: np.ndarray, camera: Camera, depth: float, ways: dict[str, Polarisation], points: int = 4
+    height: np.ndarray, camera: Camera, depth: float, ways: dict[str, Polarisation], samples: int = 4
 ) -> np.ndarray:
-    """Pixel energies as the plain sum over cells and walls, in double precision, `points` per pixel and axis."""
+    """Pixel energies as the plain sum over cells, walls and corners, double precision, `samples` along a pixel."""
     n, d = len(height), camera.sensor_distance_m
     wave = 2 * np.pi / WAVELENGTH
     pitch = camera.grid.pitch_m
     x = (np.arange(n) - (n - 1) / 2) * pitch
-    side = (np.arange(camera.window * points) - (camera.window * points - 1) / 2) * camera.pixel_m / points
+    side = (np.arange(camera.window * samples) - (camera.window * samples - 1) / 2) * camera.pixel_m / samples
     u = side / (WAVELENGTH * d)
     coverage = circle_coverage(camera.grid, camera.aperture_m)
     square = x[:, None] ** 2 + x**2
@@ -79,9 +95,13 @@ def written_out(
         foot = np.minimum(h[:, :-1], h[:, 1:]) - h.mean()
         stands = 1j / (2 * wave * INDEX) * foot * (t[:, 1:] - t[:, :-1])
         field = field + turned(cell @ ((stands + np.sign(rise) * own[np.abs(rise)] * air * low) * shade) @ dipole.T)
+    if ways:
+        shade = (coverage[1:, 1:] + coverage[1:, :-1] + coverage[:-1, 1:] + coverage[:-1, :-1]) / 4
+        points = corner_unit(WAVELENGTH, INDEX) * of_corners(wave * (INDEX - 1) * height, light)
+        field = field + line @ (points * shade) @ line.T
     energy = np.abs(field / (WAVELENGTH * d)) ** 2 / (np.pi * camera.aperture_m**2 / 4)
-    per_point = (camera.pixel_m / points) ** 2
-    return per_point * energy.reshape(camera.window, points, camera.window, points).sum((1, 3))
+    per_sample = (camera.pixel_m / samples) ** 2
+    return per_sample * energy.reshape(camera.window, samples, camera.window, samples).sum((1, 3))
 
 
 def off(found: np.ndarray, expected: np.ndarray) -> float:
@@ -201,10 +221,11 @@ def test_slopes_of_the_light_of_walls_are_those_of_differences(oblique: bool):
     walls = [Walls.of(one, 1.2e-6, INDEX / WAVELENGTH, some, PITCH) for one in tables]
     rng = np.random.default_rng(0)
     height, rate = jnp.asarray(rng.uniform(0, 1.1e-6, (8, 8)), jnp.float32), (INDEX - 1) / WAVELENGTH
+    corner = corner_unit(WAVELENGTH, INDEX) / PITCH**2
     seen = jnp.asarray(rng.normal(size=(8, 8)) + 1j * rng.normal(size=(8, 8)), jnp.complex64)
 
     def amount(height: jax.Array) -> jax.Array:
-        return jnp.sum(seen * light_of_cells_and_walls(height, rate, *walls)).real
+        return jnp.sum(seen * light_of_cells_and_walls(height, rate, corner, *walls)).real
 
     slopes = np.asarray(jax.grad(amount)(height)) * 1e-9
     steps = 1e-9 * np.eye(64, dtype=np.float32).reshape(64, 8, 8)
