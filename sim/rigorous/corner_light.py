@@ -13,11 +13,11 @@ terms, a number times u v w |w| and one times i u v, are fitted to the light of 
 wave propagation, not to Maxwell's equations: what is left of it falls from 53 to 21 % (root mean square). Beyond
 `_SETTLED` phases count as that in both, and half of the light is left.
 
-Light is taken to spread as in air, as that of walls which lie off each other (`sim.surface.lines`). Against 150 rigorous
-solutions of 68 squares of 2 x 2 cells of 1.85 um, random ones, single cells and pits, at 450, 552 and 656 nm, both
-polarisations, what is left of the orders is 0.53 % (root mean square; 1.7 % at most) where walls alone leave 1.3 % (4.0 %)
-and a thin element 24 %; of the 0th order 0.17 points (0.7 at most). Finer solutions of seven of the hardest squares:
-0.57 % (0.9), 0.15 points (0.3).
+Light is taken to spread as in air, as that of walls which lie off each other (`sim.surface.lines`). Against 150
+rigorous solutions of 68 squares of 2 x 2 cells of 1.85 um, random ones, single cells and pits, at 450, 552 and 656 nm,
+both polarisations, what is left of the orders is 0.53 % (root mean square; 1.7 % at most) where walls alone leave 1.3 %
+(4.0 %) and a thin element 24 %; of the 0th order 0.17 points (0.7 at most). Finer solutions of seven of the hardest
+squares: 0.57 % (0.9), 0.15 points (0.3).
 """
 
 from typing import Any, NamedTuple
