@@ -186,7 +186,8 @@ def line_moments(
 
         found = corner_light((cell(0, 0), cell(0, 1), cell(1, 0), cell(1, 1)))
         real, imaginary = (part * numbers.corner[:, None] * plan.parts**2 for part in found)
-        at, along = jnp.dot(relief.depth_m, place) / jnp.sum(relief.depth_m) * plan.parts
+        # Where no mask took anything, anywhere will do.
+        at, along = jnp.dot(relief.depth_m, place) / jnp.maximum(jnp.sum(relief.depth_m), 1e-12) * plan.parts
         displaced = (jnp.ones(()), 2 * along - 1, 6 * along * (along - 1) + 1)  # Legendre polynomials, from -1/2 on
         factors = jnp.stack([*(displaced[a] * at**b for a, b in _DEGREES), jnp.zeros(())])
         return factors[:, None, None, None] * jnp.stack([real, imaginary])
