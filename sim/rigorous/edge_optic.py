@@ -32,8 +32,9 @@ from sim.camera import Camera
 from sim.material import refractive_index
 from sim.optic import HeightOptic, ViewedOptic
 from sim.propagation.oblique import oblique_waves
+from sim.rigorous.cells_and_walls import light_of_cells_and_walls
 from sim.rigorous.corner_light import corner_unit
-from sim.rigorous.walls import Walls, light_of_cells_and_walls
+from sim.rigorous.walls import Walls
 from sim.rigorous.width_tables import edge_table, highest_wall, two_waves
 from sim.source import SeparableSource, SourceMap, View
 from sim.tracing import is_traced

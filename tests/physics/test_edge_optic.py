@@ -16,11 +16,12 @@ from sim.material import refractive_index
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.rigorous import compare_row, edge_widths
+from sim.rigorous.cells_and_walls import light_of_cells_and_walls
 from sim.rigorous.corner_light import corner_unit
 from sim.rigorous.edge_optic import dipole_weights, line_weights, optic_as_drawn, with_edges
 from sim.rigorous.edge_widths import edge_dipoles, series_at
 from sim.rigorous.rows import Polarisation
-from sim.rigorous.walls import Walls, light_of_cells_and_walls
+from sim.rigorous.walls import Walls
 from sim.rigorous.width_tables import edge_table
 
 PITCH, STEP, WAVELENGTH = 1.85e-6, 75e-9, 0.552e-6
