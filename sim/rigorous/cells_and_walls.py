@@ -154,20 +154,21 @@ def _walls_of_rows(across_y: Walls, across_x: Walls, start: Any, plate: _Plate) 
 def _light_of_rows(around: "_Cells", across_y: Walls, across_x: Walls) -> Array:
     both = across_y, across_x
 
-    def lines(around: _Cells) -> tuple[list[Parts], Parts]:
-        of_walls = [lines_of(around.sides(axis, reach_of(walls.weights)), walls) for axis, walls in enumerate(both)]
+    def lit(around: _Cells) -> tuple[list[Parts], list[Parts], Parts]:
+        lines = [lines_of(around.sides(axis, reach_of(walls.weights)), walls) for axis, walls in enumerate(both)]
+        dipoles = [
+            dipoles_of(around.sides(axis, reach_of(walls.dipole_weights)), walls) for axis, walls in enumerate(both)
+        ]
         four = around.corners((reach_of(across_y.weights), reach_of(across_x.weights)))
-        return of_walls, each(lambda part: around.plate.corner * part, corner_light(four))
+        return lines, dipoles, each(lambda part: around.plate.corner * part, corner_light(four))
 
     def with_points(line: Parts, points: Parts) -> Parts:
         return sum_of([line, to_cells(points, across_x.weights, 1)])
 
-    (along_x, along_y), points = _once(lines, around)
+    (along_x, along_y), dipoles, points = _once(lit, around)
     cells = [around.inner()]
-    for axis, (lit, walls) in enumerate(zip((_once(with_points, along_x, points), along_y), both, strict=True)):
-        # Cheaper to compute for every cell that has a part of it than to write down.
-        dipoles = dipoles_of(around.sides(axis, reach_of(walls.dipole_weights)), walls)
-        cells += [to_cells(lit, walls.weights, axis), to_cells(dipoles, walls.dipole_weights, axis)]
+    for axis, (lines, walls) in enumerate(zip((_once(with_points, along_x, points), along_y), both, strict=True)):
+        cells += [to_cells(lines, walls.weights, axis), to_cells(dipoles[axis], walls.dipole_weights, axis)]
     return jax.lax.complex(*sum_of(cells))
 
 
