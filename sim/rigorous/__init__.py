@@ -1,15 +1,17 @@
 """Light as Maxwell has it: rigorous solutions of rows and squares of cells, and the widths of edges taken from them.
 
-rows          coupled waves of a row that repeats
-crossed       Fourier modes of a square that repeats along both axes (fmmax)
-mirrored      one layer with a mirror, and the gradient of its orders
-edge_widths   what the wall between two heights adds to a thin element: a line of light and a dipole
-width_tables  the same by height, shipped or computed once
-walls         the light of upright walls, with its gradient
-edge_optic    a DOE with that light: `with_edges`
-comparison    a row as a thin element, with edges and by Maxwell's equations
-pieces        a square, the same three ways
-certificate   rows and squares cut out of a design, and compared
+rows             coupled waves of a row that repeats
+crossed          Fourier modes of a square that repeats along both axes (fmmax)
+mirrored         one layer with a mirror, and the gradient of its orders
+edge_widths      what the wall between two heights adds to a thin element: a line of light and a dipole
+width_tables     the same by height, shipped or computed once
+corner_light     what a corner adds where walls of both axes meet
+walls            the light of upright walls, its derivatives, and its share in the cells around
+cells_and_walls  the light of a plate of cells, walls and corners, with its gradient
+edge_optic       a DOE with that light: `with_edges`
+comparison       a row as a thin element, with edges and by Maxwell's equations
+pieces           a square, the same three ways
+certificate      rows and squares cut out of a design, and compared
 """
 
 from sim.rigorous.certificate import (
