@@ -4,8 +4,8 @@ Light that passes near a wall is not that of a thin element (`sim.rigorous.edge_
 borders of cells, where the transform has no sample: they are spread over the cells to either side, by weights whose far
 field is that of a line up to the highest wave number on the sensor, the obliquity of a near source included. So a PSF
 with edges takes the same transform as one without; where the light of a near source or that to the window's edge is too
-oblique for the cells, every cell is first split into smaller ones. Points of light at corners (`sim.rigorous.corner_light`) are
-spread like lines, along both axes.
+oblique for the cells, every cell is first split into smaller ones. Points of light at corners
+(`sim.rigorous.corner_light`) are spread like lines, along both axes.
 
 The wall between two cells side by side along x is crossed by light polarised along x (TM), and lies along light
 polarised along y (TE). The mean image of unpolarised light is that of mean widths: the square of half the difference
