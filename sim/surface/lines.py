@@ -16,7 +16,7 @@ A line is described by its moments about the border, across it and along it, as 
 (`sim.surface.cell`); its dipole by the first of these. Where borders of both axes meet is the light of a corner
 (`sim.rigorous.corner_light`), that of the four cells as if their masks lay together, at the mean of where these do.
 
-Rows are exact in that their walls are alike all along. Where masks lie off along both axes, some are in the next row
+The walls of such rows are alike all along. Where masks lie off along both axes, some are in the next row of cells
 already where others are not, which the lines of a row do not know: against wave propagation through 25 random squares,
 masks off by up to 0.1, 0.3 and 0.5 um along both axes, 5, 10 and 15 % of the light of walls and corners are missed (the
 0th order at 552 nm, root mean square; 6, 11 and 14 % without corners; 1 and 5 % where the masks lie together).

@@ -1,5 +1,6 @@
 """PSFs with the light of walls, against sums over cells, walls and corners written out, and against coupled waves."""
 
+import inspect
 from dataclasses import replace
 
 import jax
@@ -15,7 +16,7 @@ from sim.camera import Camera, Colour
 from sim.material import refractive_index
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
-from sim.rigorous import compare_row, edge_widths
+from sim.rigorous import cells_and_walls, compare_row, edge_widths
 from sim.rigorous.cells_and_walls import light_of_cells_and_walls
 from sim.rigorous.corner_light import corner_unit
 from sim.rigorous.edge_optic import dipole_weights, line_weights, optic_as_drawn, with_edges
@@ -233,6 +234,31 @@ def test_slopes_of_the_light_of_walls_are_those_of_differences(oblique: bool):
     differences = np.array([amount(height + step) - amount(height - step) for step in steps]).reshape(8, 8) / 2
     # Single precision of sums of 64 cells, over differences of a hundredth.
     np.testing.assert_allclose(slopes, differences, rtol=0, atol=2e-3 * np.abs(slopes).max())
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_a_plate_is_the_same_a_few_rows_at_a_time(rows: int, monkeypatch: pytest.MonkeyPatch):
+    """Light and slopes, with weights that differ from border to border; the last of three rows lie in two strips."""
+    of_lines = line_weights(0.3, 0.0, 0.28, RoundAperture(1.0))[0]
+    of_dipoles = dipole_weights(0.3, 0.0, 0.28, RoundAperture(1.0))
+    borders = [slice(4, 4 + 3 * count, 3) for count in (7, 5)]
+    own = [(of_lines[at].T, of_dipoles[at].T) for at in borders]
+    tables = [edge_table(1.125e-6, WAVELENGTH, INDEX, "x", axis) for axis in ("y", "x")]
+    walls = [Walls.of(of, 1.125e-6, INDEX / WAVELENGTH, w, PITCH) for of, w in zip(tables, own, strict=True)]
+    rng, rate = np.random.default_rng(5), (INDEX - 1) / WAVELENGTH
+    height = jnp.asarray(rng.uniform(0, 1.1e-6, (8, 6)), jnp.float32)
+    seen = jnp.asarray(rng.normal(size=(8, 6)) + 1j * rng.normal(size=(8, 6)), jnp.complex64)
+
+    def found() -> tuple[np.ndarray, np.ndarray]:
+        # Not the compiled one, which remembers how many rows it took.
+        uncompiled = inspect.unwrap(light_of_cells_and_walls)
+        light, back = jax.vjp(jax.jit(lambda h: uncompiled(h, rate, 0.01, *walls)), height)
+        return np.asarray(light), np.asarray(back(seen)[0])
+
+    whole = found()
+    monkeypatch.setattr(cells_and_walls, "_ROWS", rows)
+    for few, all_ in zip(found(), whole, strict=True):
+        np.testing.assert_allclose(few, all_, rtol=0, atol=1e-5 * np.abs(all_).max())
 
 
 def test_widths_from_their_series_are_those_that_were_solved():
