@@ -23,8 +23,8 @@ of a small part of a small term).
 
 Reading order: `cell` (where lines cut a cell, and what a lens sees of its pieces), `roughness`, `relief` (the errors as
 numbers), `pieces` (what is open where, and its light), `edges` (tilted walls and corners), `lines` (the light of
-walls), `opening` (the rim of the chrome), `tiles` (the whole plate), `plate` (the way in), `leakage` (where its light
-goes).
+walls), `opening` (the rim of the chrome), `tile_light` (one tile), `tiles` (the whole plate), `plate` (the way in),
+`leakage` (where its light goes).
 """
 
 from sim.surface.plate import FabricatedDoe, as_fabricated, drawn_alike

@@ -1,5 +1,7 @@
 """Tilted walls and rounded corners: what edges of openings do besides their place."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,6 +63,7 @@ def walls(
 
 # Where the middle of the area between a square corner and its rounding lies, along each axis, in radii.
 _CORNER_MIDDLE = (1 / 2 - np.pi / 4 * (1 - 4 / (3 * np.pi))) / (1 - np.pi / 4)
+_ALONE = 1e-6  # share of the area at a corner that two masks may have in common as if it were none
 
 
 def corners(
@@ -88,13 +91,17 @@ def corners(
     # joined or parted them.
     apart = jnp.clip(2 * jnp.abs(bias) / jnp.maximum(radius, 1e-6), 0.0, 1.0)
     shared = _shared_corners(along_y, along_x, bias, radius)
-    segments_x, step = along_x.state.shape[1], _CORNER_MIDDLE * radius
+    step = _CORNER_MIDDLE * radius
 
-    def seen_from(viewpoint: tuple[Array, ...]) -> tuple[Array, Array, Array, Array]:
-        """Place (y, x) of a mask's odd openings (or gaps) seen from one side, their amount `[cell]`, and the light."""
-        k, opening, side_y, side_x = viewpoint
-        y, row, low_y, outer_y = _beside(along_y, k, side_y, opening, bias[k], step)
-        x, column, low_x, outer_x = _beside(along_x, k, side_x, opening, bias[k], step)
+    viewpoints: Any = tuple(np.indices((plan.masks, 2, 2, 2)).reshape(4, -1))
+    mask, opening, side_y, side_x = viewpoints
+    beside = jax.vmap(_beside, (None, 0, 0, 0, 0, None))
+    places_y = beside(along_y, mask, side_y, opening, bias[mask], step)
+    places_x = beside(along_x, mask, side_x, opening, bias[mask], step)
+
+    def seen_from(viewpoint: tuple[tuple[Array, ...], ...]) -> Array:
+        """Amount `[y, x]` of a mask's odd openings (or gaps) seen from one side."""
+        (k, opening, side_y, side_x), (low_y, outer_y), (low_x, outer_x) = viewpoint
         own, other_y, other_x, far = (
             share_of(is_open, k, low_y + (side_y ^ dy), low_x + (side_x ^ dx))
             for dy, dx in ((0, 0), (1, 0), (0, 1), (1, 1))
@@ -102,7 +109,7 @@ def corners(
         around = [share_of(is_open, k, outer_y + dy, outer_x + dx) for dy, dx in ((0, 0), (2, 2), (0, 2), (2, 0))]
         touching = (around[0] == around[1]) & (around[2] == around[3]) & (around[0] != around[2])
         odd = (own == opening) & (own != other_y) & (own != other_x) & (own != far)
-        return y, x, odd * jnp.where(touching, apart[k], 1.0), light[row * segments_x + column]
+        return odd * jnp.where(touching, apart[k], 1.0)
 
     # Where a mask's etch is missing from an opening, or added to a gap, by what the light changes: factor - 1.
     phase = 2 * jnp.pi * jnp.array([-1, 1])[:, None] * rates * relief.depth_m[:, None, None]
@@ -112,28 +119,37 @@ def corners(
         return Pair(turn[0, :, None] * amount, turn[1, :, None] * amount)
 
     # Loops, because their results exist: fused into what follows, they would be computed again for every colour.
-    viewpoints = tuple(np.indices((plan.masks, 2, 2, 2)).reshape(4, -1))
-    ys, xs, amounts, lights = jax.lax.map(seen_from, viewpoints)
-    points = point_moments(axis_values(ys, plan.parts), axis_values(xs, plan.parts))
-    each = amounts, turns[viewpoints[:2]]
-    gained = jax.lax.map(lambda at: gain(*at[1:]).times(Pair(*at[0])), (lights, *each))
-    gained = Pair(*(part.reshape(plan.masks, 2, 4, *part.shape[1:]) for part in gained))
-    amounts = amounts.reshape(plan.masks, 2, 4, 1, -1)
+    amounts = jax.lax.map(seen_from, (viewpoints, places_y[2:], places_x[2:]))
+    amounts = amounts.reshape(len(amounts), -1)
+    pieces = places_y[1] * along_x.state.shape[1] + places_x[1]
+    each = pieces, amounts, turns[mask, opening]
+    gained = Pair(*jax.lax.map(lambda at: gain(*at[1:]).times(Pair(*light[at[0]])), each))
+    points = point_moments(*(axis_values(places[0], plan.parts) for places in (places_y, places_x)))
 
-    def after(found: Pair, earlier: tuple[Array, ...]) -> tuple[Pair, None]:
-        """The light that a mask gains where an earlier one changes what it finds."""
-        amount, turn, share = earlier
-        # On one side a cell has an odd opening or an odd gap of a mask, not both.
-        gaps, openings = (gain(amount[o], turn[o]) for o in (0, 1))
-        return found.plus(found.times(gaps.plus(openings)), share), None
+    def total(real: Array, imaginary: Array) -> tuple[Array, Array]:
+        return summed(points, real, kept=2), summed(points, imaginary, kept=2)
 
-    total = Pair(jnp.zeros(()), jnp.zeros(()))
-    for k in range(plan.masks):
-        own = Pair(*(part[k] for part in gained))
-        own, _ = jax.lax.scan(after, own, (amounts[:k], turns[:k], shared[k, :k]))
-        at = points.reshape(-1, plan.masks, 8)[:, k]
-        total = total.plus(Pair(*(summed(at, part.reshape(8, *part.shape[2:]), kept=2) for part in own)))
-    return (1 - np.pi / 4) * radius**2 * jnp.stack(total, axis=1)
+    def together() -> tuple[Array, Array]:
+        """Gains of masks that have corners in common, one after the other."""
+        own = Pair(*(part.reshape(plan.masks, 2, 4, *part.shape[1:]) for part in gained))
+        found = amounts.reshape(plan.masks, 2, 4, 1, -1)
+
+        def after(gained: Pair, earlier: tuple[Array, ...]) -> tuple[Pair, None]:
+            """The light that a mask gains where an earlier one changes what it finds."""
+            amount, turn, share = earlier
+            # On one side a cell has an odd opening or an odd gap of a mask, not both.
+            gaps, openings = (gain(amount[o], turn[o]) for o in (0, 1))
+            return gained.plus(gained.times(gaps.plus(openings)), share), None
+
+        masks = []
+        for k in range(plan.masks):
+            of_mask = Pair(*(part[k] for part in own))
+            masks.append(jax.lax.scan(after, of_mask, (found[:k], turns[:k], shared[k, :k]))[0])
+        return total(*(jnp.stack(parts).reshape(gained.real.shape) for parts in zip(*masks, strict=True)))
+
+    alone = jnp.max(jnp.tril(shared, -1)) < _ALONE
+    changed = jax.lax.cond(alone, lambda: total(*gained), together)
+    return (1 - np.pi / 4) * radius**2 * jnp.stack(changed, axis=1)
 
 
 def _beside(

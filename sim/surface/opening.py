@@ -25,7 +25,6 @@ _SQUARES = 6  # per part of a cell and axis; within each the rim is straight, an
 class Opening(NamedTuple):
     """The chrome's opening, as numbers that all tiles share."""
 
-    coverage: Float[Array, "v u"]  # open share of every part of a cell
     centre_m: Float[Array, "2"]  # (y, x)
     outline: RoundOutline | BoxOutline | MaskOutline
 
@@ -35,16 +34,17 @@ def through_opening(
     lines: Float[Array, "3 kind 2 w t t"],
     light: Float[Array, "piece 2 w cell"],
     along: tuple[Cuts, Cuts],
+    coverage: Float[Array, "s s"],
     opening: Opening,
     start: tuple[Array, Array],
     plan: TilePlan,
 ) -> tuple[Float[Array, "m 2 w t t"], Float[Array, "3 kind 2 w t t"]]:
     """Moments of one tile's cells, and of lines, behind the chrome.
 
-    `light` is that of the pieces into which the cells are cut `along` y and x; `start` is the tile's first cell (y, x).
+    `light` is that of the pieces into which the cells are cut `along` y and x; `coverage` the open share of every part
+    of them; `start` the tile's first cell (y, x).
     """
-    parts, size = plan.parts, TILE * plan.parts
-    coverage = jax.lax.dynamic_slice(opening.coverage, (start[0] * parts, start[1] * parts), (size, size))
+    parts = plan.parts
 
     def cut() -> tuple[Array, Array]:
         own = jnp.transpose(coverage.reshape(TILE, parts, TILE, parts), (1, 3, 0, 2))

@@ -52,10 +52,10 @@ def mask_states(
 
 
 def share_of(shares: Shaped[Array, "mask 2 2 window window"], mask: Any, along_y: Any, along_x: Any) -> Array:
-    """Open share `[cell]` of one mask in given `STATES` along y and x, as `mask_states` has it."""
+    """Open share `[y, x]` of one mask in given `STATES` along y and x, as `mask_states` has it."""
     places = [(state % 2, state // 2 - _NEIGHBOURS[0]) for state in (along_y, along_x)]
     (within_y, y), (within_x, x) = places
-    return jax.lax.dynamic_slice(shares, (mask, within_y, within_x, y, x), (1, 1, 1, TILE, TILE)).reshape(-1)
+    return jax.lax.dynamic_slice(shares, (mask, within_y, within_x, y, x), (1, 1, 1, TILE, TILE))[0, 0, 0]
 
 
 def own_states(shares: Float[Array, "mask 2 2 window window"]) -> Float[Array, "mask 3 3 cell"]:
@@ -72,8 +72,8 @@ def light_of(height: Float[Array, "p c"], rates: Float[Array, " w"]) -> Float[Ar
     One sine of the phase and of the phase plus a quarter, to 4e-6 like `sim.propagation.pupil.cis`: without complex
     numbers it compiles to a loop several times faster.
     """
-    waves = height[:, None] * rates[None, :, None]
-    waves = jnp.stack([waves + 0.25, waves], axis=1)
+    quarter = jnp.array([0.25, 0.0])[:, None, None]
+    waves = height[:, None, None] * rates[:, None] + quarter
     waves = waves - jnp.round(waves)
     folded = jnp.copysign(0.25 - jnp.abs(jnp.abs(waves) - 0.25), waves)
     z = folded * folded

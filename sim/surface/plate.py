@@ -29,7 +29,8 @@ from sim.surface.opening import Opening
 from sim.surface.pieces import TILE
 from sim.surface.relief import plan_of, relief_of, require_possible, view_weights
 from sim.surface.roughness import cell_roughness, cell_share
-from sim.surface.tiles import transmission_of
+from sim.surface.tiles import CellMaps, transmission_of
+from sim.threads import at_once
 from sim.tracing import is_traced, single, stacked
 
 
@@ -130,15 +131,15 @@ def as_fabricated(
     for particle in variation.particles:
         _keep_off(etched, particle, camera.grid)
     widths = None
-    if traced or variation.etch_lag:  # of the opening that a pixel belongs to: the shorter of its runs, at most 255
-        widths = np.stack([np.minimum(run_lengths(plane), run_lengths(plane.T).T) for plane in etched])
+    if traced or variation.etch_lag:
+        widths = np.stack(list(at_once(_widths, list(etched))))
     rough = None
     if traced or variation.roughness_m:
         rough = cell_roughness(camera.grid, variation.roughness_m, variation.correlation_m, variation.seed)
     walls = None
     if camera.light == "edges":
         walls = wall_numbers(camera, lines, _highest_m(process, variation, traced))
-    relief = relief_of(process, variation, rough, walls)
+    relief = relief_of(process, variation, walls)
     packed = np.packbits(etched, axis=0, bitorder="little")[0]  # bit k for mask k
     left = np.ones(len(waves), np.float32)
     if traced or variation.roughness_m:
@@ -149,13 +150,19 @@ def as_fabricated(
     grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
     centre = stacked([single(variation.chrome_y_m), single(variation.chrome_x_m)])
-    opening = Opening(coverage, centre, outline_of(camera.opening, variation.chrome_diameter_m))
-    transmission, means = transmission_of(plan, (along_y, along_x), packed, widths, relief, rates, left, opening)
+    opening = Opening(centre, outline_of(camera.opening, variation.chrome_diameter_m))
+    maps = CellMaps(packed, widths, rough, coverage)
+    transmission, means = transmission_of(plan, (along_y, along_x), maps, relief, rates, left, opening)
     found = FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
     if camera.light == "scalar":
         return found
     # Lines of light have no mean within a cell.
     return replace(found, means=found.from_afar(lines) / jnp.where(coverage > 0, coverage, 1.0))
+
+
+def _widths(plane: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
+    """Width of the opening that a pixel belongs to: the shorter of its runs, at most 255."""
+    return np.minimum(run_lengths(plane), run_lengths(plane.T).T)
 
 
 def _highest_m(process: Process, variation: Variation, traced: bool) -> float:

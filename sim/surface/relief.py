@@ -47,7 +47,6 @@ class EtchParameters(NamedTuple):
     lag: Array  # share of depth lost per depth over width
     bowl: Array  # uniformity: depth share per r² (metres²)
     tilt: Array  # `[(y, x)]` depth share per metre
-    rough_m: Array | None  # `[y, x]` height of the roughness, or None
     height_m: Array  # height of the blank surface above the deepest nominal floor
     walls: Any = None  # their light, `sim.surface.lines.WallNumbers`, or None
 
@@ -95,7 +94,7 @@ def plan_of(
     reach, lines = _USUAL_REACH, camera.light == "edges"
     cut = corners = walls = True
     if not traced:
-        corners, walls = variation.corner_radius_m > 0, variation.sidewall_rad > 0
+        corners, walls = bool(variation.corner_radius_m > 0), bool(variation.sidewall_rad > 0)
         shifts = np.abs(_corner_shifts_m(grid, process, variation))
         # Masks may be drawn against the bias: what is left then is rounding, and no edge has moved.
         left = [abs(variation.common_cd_bias_m + own) for own in variation.cd_bias_m or (0.0,)]
@@ -137,10 +136,11 @@ def _views(wavelength_m: float, waves: ObliqueWaves, depths_m: tuple[float, floa
 def view_weights(
     camera: Camera, parts: int, views: tuple[View, ...], tile: int, count: int
 ) -> Float[np.ndarray, "..."]:
-    """Light that moments of a row of tiles add to cells: `[tile, view, 1 or 2, kind, cell, cell + 2 reach]`.
+    """Light that moments of a row of tiles add to cells: `[tile, view, kind, in, cell, out, cell + 2 reach]`.
 
-    Along an axis with `count` DOE cells, of which a tile is `tile` wide; each is divided into `parts`. The third axis
-    holds real and imaginary parts, if there are any. Kinds are those of `moment_weights`: of lines, with edges.
+    Along an axis with `count` DOE cells, of which a tile is `tile` wide; each is divided into `parts`. Kinds are those
+    of `moment_weights`: of lines, with edges. `in` and `out` are real and imaginary part, of the moments and of the
+    light; one place each where weights are real.
     """
     size, cells = tile * parts, count * parts
     count, radius = -(-count // tile), camera.opening.widest_m / 2 / camera.grid.pitch_m * parts
@@ -163,9 +163,10 @@ def view_weights(
     spread = np.zeros((count, len(views), weights.shape[3], size, size + 2 * REACH), complex)
     for cell in range(size):
         spread[..., cell, cell : cell + 2 * REACH + 1] = weights[:, :, cell]
-    real, imaginary = np.real(spread), np.imag(spread)
-    kinds = [real] if np.abs(imaginary).max() < 1e-6 else [real, imaginary]
-    return np.stack(kinds, 2).astype(np.float32)
+    real, imaginary = np.real(spread).astype(np.float32), np.imag(spread).astype(np.float32)
+    if np.abs(imaginary).max() < 1e-6:
+        return real[:, :, :, None, :, None]
+    return np.stack([np.stack([real, imaginary], -2), np.stack([-imaginary, real], -2)], 3)
 
 
 def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.ndarray:
@@ -185,7 +186,6 @@ def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.n
 def relief_of(
     process: Process,
     variation: Variation,
-    rough_m: Float[Array, "y x"] | None = None,
     walls: Any = None,
 ) -> EtchParameters:
     """The errors of one plate, the depths of its etches and the light of its walls as the numbers that tiles share."""
@@ -217,7 +217,6 @@ def relief_of(
         lag=single(variation.etch_lag),
         bowl=single(variation.radial_nonuniformity) / radius**2,
         tilt=tilt * (np.float32(1) / np.float32(radius)),
-        rough_m=rough_m,
         height_m=single(levels.count - 1) * single(levels.step_m) if levels.is_binary else single(levels.total_m),
         walls=walls,
     )
