@@ -195,6 +195,33 @@ def test_edges_make_a_thin_element_nearly_rigorous(wavelength: float, seed: int)
     assert found.zeroth(found.edges) == pytest.approx(found.zeroth(found.rigorous), abs=1e-3)
 
 
+def test_what_edges_leave_of_fine_gratings_is_light_of_walls_one_cell_apart():
+    """0th orders of gratings of two cells are off by 0.29 points (root mean square), by 0.11 with light of neighbours.
+
+    A pit and a pillar of one cell, each alone among seven, have light beyond that of their two walls: solved rigorously.
+    """
+    wavelength = 0.552e-6
+    index, left, taken = silica(wavelength), [], []
+
+    def amplitude(steps: list[int], polarisation: Polarisation) -> tuple[complex, complex]:
+        height = STEP * np.array(steps, float)
+        number, edges = thin_amplitudes(height, CELL, wavelength, index, polarisation)
+        waves = int(2 * len(steps) * CELL * index / wavelength)
+        solved = orders_of(row_slabs(height, CELL, index), wavelength, index, polarisation, waves)
+        bare = 2 * (1 if polarisation == "TE" else index) / (1 + index)
+        return complex(edges[number == 0][0]), complex(solved.amplitude[solved.at(0)]) / bare
+
+    for steps in range(1, 16):
+        for polarisation in POLARISATIONS:
+            edges, rigorous = amplitude([0, steps], polarisation)
+            alone = [amplitude([out] * 3 + [of] + [out] * 3, polarisation) for out, of in ((0, steps), (steps, 0))]
+            more = sum(7 * (solved - walls) for walls, solved in alone) / 2
+            left.append(abs(edges) ** 2 - abs(rigorous) ** 2)
+            taken.append(abs(edges + more) ** 2 - abs(rigorous) ** 2)
+    assert 0.002 < np.sqrt(np.mean(np.square(left))) < 0.0035  # as measured, with room for another table of widths
+    assert np.sqrt(np.mean(np.square(taken))) < 0.5 * np.sqrt(np.mean(np.square(left)))
+
+
 def test_a_real_blazed_grating_loses_what_edges_say():
     """Four steps of 300 nm at 552 nm: 78.2 % thin; 74.1 and 75.2 % rigorous, of the light before the face."""
     wavelength = 0.552e-6
