@@ -198,7 +198,7 @@ def test_edges_make_a_thin_element_nearly_rigorous(wavelength: float, seed: int)
 def test_what_edges_leave_of_fine_gratings_is_light_of_walls_one_cell_apart():
     """0th orders of gratings of two cells are off by 0.29 points (root mean square), by 0.11 with light of neighbours.
 
-    A pit and a pillar of one cell, each alone among seven, have light beyond that of their two walls: solved rigorously.
+    A pit and a pillar of one cell, each alone among seven, have light beyond that of their two walls, solved for here.
     """
     wavelength = 0.552e-6
     index, left, taken = silica(wavelength), [], []
