@@ -160,6 +160,14 @@ def _process_rows(training: str, label: str) -> tuple[MethodRow, MethodRow]:
     return right, wrong
 
 
+def _capture_rows(name: str, plate: str, label: str, paper: str | None = None) -> tuple[MethodRow, MethodRow]:
+    """What a camera sees through the plate of a training, as drawn and as fabricated."""
+    return (
+        MethodRow(name, label, "as_seen", None, plate, paper=paper),
+        MethodRow(f"{name}_fabricated", f"{label}, as fabricated", "as_seen", None, plate, fabricated=True),
+    )
+
+
 def table_2(obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
     """Rows of Table 2 for an obstruction.
 
@@ -172,8 +180,9 @@ def table_2(obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
         _network("proposed", "Proposed", "proposed"),
         *_process_rows("proposed", "Proposed"),
         *((_network(ROBUST, "Robust plate"), *_process_rows(ROBUST, "Robust plate")) if robust else ()),
-        MethodRow("optics_only", "optics alone: its capture", "as_seen", None, "optics_only", paper="optics_only"),
-        MethodRow("capture", "capture through the plate", "as_seen", None, "proposed", paper="capture"),
+        *_capture_rows("optics_only", "optics_only", "optics alone: its capture", paper="optics_only"),
+        *_capture_rows("capture", "proposed", "capture through the plate", paper="capture"),
+        *(_capture_rows("robust_capture", ROBUST, "capture through the robust plate") if robust else ()),
         MethodRow("conventional_capture", "conventional capture", "as_seen", paper="conventional_capture"),
         MethodRow("conventional_network", "conventional camera, same network", "network", "conventional"),
         *_inpainting("fourier_inpainting", "Fourier inpainting (after LaMa)", "fourier_inpainting"),
