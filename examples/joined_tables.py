@@ -5,8 +5,9 @@
 
 TABLE is `table.csv` of a run under the name of its folder (table2-dirt-paper.csv). With --later, the rows that --rows
 names are taken from another run's `table.csv`, whatever TABLE has of these names is replaced, and column `run` counts
-on for them: their differences are to the proposed row of their own run, not to that of the table. Written beside TABLE:
-the table itself, LaTeX and the picture, in which such rows have a dagger.
+on for them: their differences are to the proposed row of their own run, not to that of the table. Where both proposed
+rows have the same scores, the trainings and pairs are the same, and `run` is that of the table. Written beside TABLE:
+the table itself, LaTeX and the picture, in which rows of other runs have a dagger.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from fab.errors import InputError
 from fab.figure import save
 from fab.files import read_bytes, write_atomic
 
+PROPOSED = "proposed"
 Lines = list[dict[str, str]]
 
 
@@ -71,8 +73,13 @@ def joined(table: EvaluationTable, later: EvaluationTable, names: Sequence[str])
     for name in names:
         if name not in scored:
             raise InputError("rows", f"must be among {', '.join(scored)}", name, "Choose among these.")
-    run = 1 + max(one.run for one in table.rows if one.row.name not in names)
-    own = {one.row.name: one for one in table.rows} | {name: replace(scored[name], run=run) for name in names}
+    own = {one.row.name: one for one in table.rows}
+    first = own.get(PROPOSED)
+    if first and PROPOSED in scored and scored[PROPOSED].scores == first.scores:
+        run = first.run  # the very same trainings and pairs, looked at again
+    else:
+        run = 1 + max(one.run for one in table.rows if one.row.name not in names)
+    own |= {name: replace(scored[name], run=run) for name in names}
     order = [row.name for row in rows_of(table.number, table.obstruction, robust=True)]
     return replace(table, rows=tuple(own[name] for name in order if name in own))
 
