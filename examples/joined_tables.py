@@ -5,9 +5,9 @@
 
 TABLE is `table.csv` of a run under the name of its folder (table2-dirt-paper.csv). With --later, the rows that --rows
 names are taken from another run's `table.csv`, whatever TABLE has of these names is replaced, and column `run` counts
-on for them: their differences are to the proposed row of their own run, not to that of the table. Where both proposed
-rows have the same scores, the trainings and pairs are the same, and `run` is that of the table. Written beside TABLE:
-the table itself, LaTeX and the picture, in which rows of other runs have a dagger.
+on for them: their differences are to the proposed row of their own run, not to that of the table. Where rows of
+TABLE were compared with a proposed row of the same scores, trainings and pairs are the same, and so is `run`. Written
+beside TABLE: the table itself, LaTeX and the picture, in which rows of other runs than the first have a dagger.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from fab.figure import save
 from fab.files import read_bytes, write_atomic
 
 PROPOSED = "proposed"
+DIGITS = 2e-4  # six digits of each of three numbers are kept
 Lines = list[dict[str, str]]
 
 
@@ -74,14 +75,23 @@ def joined(table: EvaluationTable, later: EvaluationTable, names: Sequence[str])
         if name not in scored:
             raise InputError("rows", f"must be among {', '.join(scored)}", name, "Choose among these.")
     own = {one.row.name: one for one in table.rows}
-    first = own.get(PROPOSED)
-    if first and PROPOSED in scored and scored[PROPOSED].scores == first.scores:
-        run = first.run  # the very same trainings and pairs, looked at again
-    else:
-        run = 1 + max(one.run for one in table.rows if one.row.name not in names)
+    kept = [one for one in table.rows if one.row.name not in names]
+    same = [one.run for one in kept if PROPOSED in scored and _as_proposed(one, scored[PROPOSED])]
+    run = same[0] if same else 1 + max(one.run for one in kept)
     own |= {name: replace(scored[name], run=run) for name in names}
     order = [row.name for row in rows_of(table.number, table.obstruction, robust=True)]
     return replace(table, rows=tuple(own[name] for name in order if name in own))
+
+
+def _as_proposed(row: TableRow, proposed: TableRow) -> bool:
+    """Whether a row was compared with this proposed row, of the same trainings and pairs, or is that row."""
+    means = [
+        (proposed.scores[region][score].mean, own.mean - (row.gain[region][score].mean if row.gain else 0.0))
+        for region, of in row.scores.items()
+        for score, own in of.items()
+        if row.gain or row.row.name == PROPOSED
+    ]
+    return bool(means) and all(abs(one - other) < DIGITS for one, other in means)
 
 
 def _row(row: MethodRow, lines: Lines, number: int, obstruction: str) -> TableRow:

@@ -13,6 +13,7 @@ sys.path.insert(0, str(ROOT / "examples"))
 import joined_tables  # noqa: E402
 
 NAME = "table2-fence-paper.csv"
+CAPTURES = ["capture_fabricated", "robust_capture", "robust_capture_fabricated"]
 ROBUST = ["robust", "robust_fabricated", "robust_untold"]
 
 
@@ -33,7 +34,8 @@ def test_rows_of_a_later_run_are_joined(tmp_path: Path):
         table = csv.DictWriter(file, [name for name in lines[0] if name != "run"], lineterminator="\n")
         table.writeheader()  # as the tables of one run once were, without a column for it
         table.writerows({k: v for k, v in one.items() if k != "run"} for one in lines if one["run"] == "1")
-    for later, rows in (("robust", ROBUST), ("biharmonic", ["biharmonic_of_capture"])):
+    joined = {"robust": ROBUST, "biharmonic": ["biharmonic_of_capture"], "captures": CAPTURES}
+    for later, rows in joined.items():
         given = [str(path), "--later", str(RESULTS / "later" / later / NAME), "--rows", *rows]
         assert joined_tables.main(given) == 0
     assert path.read_bytes() == (RESULTS / NAME).read_bytes()
