@@ -22,7 +22,7 @@ from doedesign.cli import exit_code
 from doedesign.evaluation.published import published_scores
 from doedesign.evaluation.rows import MethodRow, rows_of
 from doedesign.evaluation.statistics import BootstrapInterval
-from doedesign.evaluation.tables import EvaluationTable, PairFacts, TableRow
+from doedesign.evaluation.tables import EvaluationTable, Intervals, PairFacts, TableRow
 from fab.errors import InputError
 from fab.figure import save
 from fab.files import read_bytes, write_atomic
@@ -85,12 +85,15 @@ def joined(table: EvaluationTable, later: EvaluationTable, names: Sequence[str])
 
 def _as_proposed(row: TableRow, proposed: TableRow) -> bool:
     """Whether a row was compared with this proposed row, of the same trainings and pairs, or is that row."""
-    means = [
-        (proposed.scores[region][score].mean, own.mean - (row.gain[region][score].mean if row.gain else 0.0))
-        for region, of in row.scores.items()
-        for score, own in of.items()
-        if row.gain or row.row.name == PROPOSED
-    ]
+    if not row.gain and row.row.name != PROPOSED:
+        return False
+
+    def mean(intervals: Intervals, region: str, score: str) -> float:
+        found = intervals.get(region, {}).get(score)
+        return found.mean if found else 0.0
+
+    places = [(region, score) for region, of in row.scores.items() for score in of]
+    means = [(mean(proposed.scores, *at), mean(row.scores, *at) - mean(row.gain, *at)) for at in places]
     return bool(means) and all(abs(one - other) < DIGITS for one, other in means)
 
 

@@ -161,7 +161,7 @@ def _process_rows(training: str, label: str) -> tuple[MethodRow, MethodRow]:
 
 
 def _capture_rows(name: str, plate: str, label: str, paper: str | None = None) -> tuple[MethodRow, MethodRow]:
-    """What a camera sees through the plate of a training, as drawn and as fabricated."""
+    """Captures through the plate of a training, as drawn and as fabricated."""
     return (
         MethodRow(name, label, "as_seen", None, plate, paper=paper),
         MethodRow(f"{name}_fabricated", f"{label}, as fabricated", "as_seen", None, plate, fabricated=True),

@@ -23,7 +23,7 @@ _ROWS = 8
 
 
 class CellMaps(NamedTuple):
-    """What differs from cell to cell of a plate, numpy's arrays or jax's.
+    """All that differs from cell to cell of a plate, numpy's arrays or jax's.
 
     Attributes:
         etched: etches of every cell, one bit each.
@@ -125,7 +125,7 @@ class _Plate(NamedTuple):
                 within[...] = found
 
     def add(self, first: int, light: list[Complex[np.ndarray, "v u"]]) -> None:
-        """What is spilt about the upper border of a row of tiles."""
+        """Light that is spilt about the upper border of a row of tiles."""
         for own, block in zip(self.light, light, strict=True):
             within, found = self._overlap(own, block, first, _reach(self.plan))
             within += found
