@@ -1,5 +1,6 @@
 """Tilted walls and rounded corners: what edges of openings do besides their place."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -96,10 +97,10 @@ def corners(
     viewpoints: Any = tuple(np.indices((plan.masks, 2, 2, 2)).reshape(4, -1))
     mask, opening, side_y, side_x = viewpoints
     beside = jax.vmap(_beside, (None, 0, 0, 0, 0, None))
-    places_y = beside(along_y, mask, side_y, opening, bias[mask], step)
-    places_x = beside(along_x, mask, side_x, opening, bias[mask], step)
+    y, row, *below_y = beside(along_y, mask, side_y, opening, bias[mask], step)
+    x, column, *below_x = beside(along_x, mask, side_x, opening, bias[mask], step)
 
-    def seen_from(viewpoint: tuple[tuple[Array, ...], ...]) -> Array:
+    def seen_from(viewpoint: tuple[Sequence[Array], ...]) -> Array:
         """Amount `[y, x]` of a mask's odd openings (or gaps) seen from one side."""
         (k, opening, side_y, side_x), (low_y, outer_y), (low_x, outer_x) = viewpoint
         own, other_y, other_x, far = (
@@ -115,41 +116,49 @@ def corners(
     phase = 2 * jnp.pi * jnp.array([-1, 1])[:, None] * rates * relief.depth_m[:, None, None]
     turns = jnp.stack([jnp.cos(phase) - 1, jnp.sin(phase)], axis=2)  # [mask, opening, 2, w]
 
-    def gain(amount: Array, turn: Array) -> Pair:
-        return Pair(turn[0, :, None] * amount, turn[1, :, None] * amount)
-
     # Loops, because their results exist: fused into what follows, they would be computed again for every colour.
-    amounts = jax.lax.map(seen_from, (viewpoints, places_y[2:], places_x[2:]))
+    amounts = jax.lax.map(seen_from, (viewpoints, below_y, below_x))
     amounts = amounts.reshape(len(amounts), -1)
-    pieces = places_y[1] * along_x.state.shape[1] + places_x[1]
-    each = pieces, amounts, turns[mask, opening]
-    gained = Pair(*jax.lax.map(lambda at: gain(*at[1:]).times(Pair(*light[at[0]])), each))
-    points = point_moments(*(axis_values(places[0], plan.parts) for places in (places_y, places_x)))
+    each = row * along_x.state.shape[1] + column, amounts, turns[mask, opening]
+    gained = Pair(*jax.lax.map(lambda at: _gain(*at[1:]).times(Pair(*light[at[0]])), each))
+    points = point_moments(axis_values(y, plan.parts), axis_values(x, plan.parts))
 
     def total(real: Array, imaginary: Array) -> tuple[Array, Array]:
         return summed(points, real, kept=2), summed(points, imaginary, kept=2)
 
-    def together() -> tuple[Array, Array]:
-        """Gains of masks that have corners in common, one after the other."""
-        own = Pair(*(part.reshape(plan.masks, 2, 4, *part.shape[1:]) for part in gained))
-        found = amounts.reshape(plan.masks, 2, 4, 1, -1)
-
-        def after(gained: Pair, earlier: tuple[Array, ...]) -> tuple[Pair, None]:
-            """The light that a mask gains where an earlier one changes what it finds."""
-            amount, turn, share = earlier
-            # On one side a cell has an odd opening or an odd gap of a mask, not both.
-            gaps, openings = (gain(amount[o], turn[o]) for o in (0, 1))
-            return gained.plus(gained.times(gaps.plus(openings)), share), None
-
-        masks = []
-        for k in range(plan.masks):
-            of_mask = Pair(*(part[k] for part in own))
-            masks.append(jax.lax.scan(after, of_mask, (found[:k], turns[:k], shared[k, :k]))[0])
-        return total(*(jnp.stack(parts).reshape(gained.real.shape) for parts in zip(*masks, strict=True)))
-
     alone = jnp.max(jnp.tril(shared, -1)) < _ALONE
-    changed = jax.lax.cond(alone, lambda: total(*gained), together)
+    changed = jax.lax.cond(
+        alone, lambda: total(*gained), lambda: total(*_in_common(gained, amounts, turns, shared, plan.masks))
+    )
     return (1 - np.pi / 4) * radius**2 * jnp.stack(changed, axis=1)
+
+
+def _gain(amount: Float[Array, "... c"], turn: Float[Array, "2 w"]) -> Pair:
+    return Pair(turn[0, :, None] * amount, turn[1, :, None] * amount)
+
+
+def _in_common(
+    gained: Pair,
+    amounts: Float[Array, "seen c"],
+    turns: Float[Array, "mask opening 2 w"],
+    shared: Float[Array, "mask mask"],
+    masks: int,
+) -> Pair:
+    """Light that masks gain, `[seen, w, c]`, where an earlier one with a corner in common changes what they find."""
+    own = Pair(*(part.reshape(masks, 2, 4, *part.shape[1:]) for part in gained))
+    found = amounts.reshape(masks, 2, 4, 1, -1)
+
+    def after(gained: Pair, earlier: tuple[Array, ...]) -> tuple[Pair, None]:
+        amount, turn, share = earlier
+        # On one side a cell has an odd opening or an odd gap of a mask, not both.
+        gaps, openings = (_gain(amount[o], turn[o]) for o in (0, 1))
+        return gained.plus(gained.times(gaps.plus(openings)), share), None
+
+    each = [
+        jax.lax.scan(after, Pair(own.real[k], own.imaginary[k]), (found[:k], turns[:k], shared[k, :k]))[0]
+        for k in range(masks)
+    ]
+    return Pair(*(jnp.stack(parts).reshape(gained.real.shape) for parts in zip(*each, strict=True)))
 
 
 def _beside(

@@ -69,7 +69,13 @@ def _reach(plan: TilePlan) -> int:
 
 
 def transmission_of(
-    plan: TilePlan, along: tuple[Any, Any], maps: CellMaps, *numbers: Any
+    plan: TilePlan,
+    along: tuple[Any, Any],
+    maps: CellMaps,
+    relief: EtchParameters,
+    rates: Any,
+    left: Any,
+    opening: Opening,
 ) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     """Transmission of every cell, tile by tile, with the far field of plate and chrome in every view; means without.
 
@@ -79,16 +85,18 @@ def transmission_of(
         plan: what is compiled.
         along: the `view_weights` along y and x, numpy's.
         maps: of the cells.
-        numbers: numpy's or jax's: `relief`, without its roughness; waves per metre of height of every wavelength; the
-            amplitude that roughness finer than a cell leaves of each; and the chrome's `Opening`.
+        relief: the errors as numbers, numpy's or jax's, like the rest.
+        rates: waves per metre of height of every wavelength.
+        left: amplitude that roughness finer than a cell leaves of each.
+        opening: that of the chrome.
     """
-    (weights_y, weights_x), (count, _) = along, _tiles_along(plan)
+    (weights_y, weights_x), (count, _), numbers = along, _tiles_along(plan), (relief, rates, left, opening)
     if is_traced(maps, *numbers) or in_jit():
         return _compiled(plan, weights_y, weights_x, maps, *numbers)
     rows_of, long = _compiled_quickly(), min(_ROWS, count)
     weights_x = jnp.asarray(weights_x)  # once for all rows
     maps = jax.tree.map(np.asarray, maps)
-    plate = _Plate.empty(plan, len(numbers[1]))
+    plate = _Plate.empty(plan, len(rates))
 
     def part(first: int) -> tuple[int, Any]:
         own = weights_y[np.minimum(np.arange(first, first + long), count - 1)]
