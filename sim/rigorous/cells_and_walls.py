@@ -5,7 +5,7 @@ had than to be filled; that for some rows is at hand.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from jaxtyping import Array, Complex, Float
 from sim.propagation.pupil import cis
 from sim.rigorous.corner_light import CornerCell, Four, corner_light, corner_slopes
 from sim.rigorous.walls import (
+    Corners,
     Parts,
     Sides,
     Walls,
@@ -36,7 +37,7 @@ _ROWS = 96  # of cells that are computed together; with what lies around them
 
 @jax.jit
 def light_of_cells_and_walls(
-    height_m: Float[Array, "y x"], rate: Any, corner: Any, across_y: Walls, across_x: Walls
+    height_m: Float[Array, "y x"], rate: Any, corners: Corners, across_y: Walls, across_x: Walls
 ) -> Complex[Array, "y x"]:
     """Transmission of cells whose far field is that of thin cells, the walls between them and corners where they meet.
 
@@ -45,26 +46,27 @@ def light_of_cells_and_walls(
     Args:
         height_m: height of every cell.
         rate: waves per metre of height.
-        corner: unit of the light of corners over the square of the pitch (`corner_unit`).
+        corners: what points at corners add; their weights reach no farther than those of walls.
         across_y: walls between cells that are neighbours along y.
         across_x: the same along x.
 
     Returns:
         values of the cells; derivatives are taken with respect to the heights alone, and backwards.
     """
-    return _light(height_m, rate, corner, across_y, across_x)
+    return _light(height_m, rate, corners, across_y, across_x)
 
 
 @jax.custom_vjp
-def _light(height_m: Array, rate: Any, corner: Any, across_y: Walls, across_x: Walls) -> Array:
-    return _forward(height_m, rate, corner, across_y, across_x)[0]
+def _light(height_m: Array, rate: Any, corners: Corners, across_y: Walls, across_x: Walls) -> Array:
+    return _forward(height_m, rate, corners, across_y, across_x)[0]
 
 
 def _forward(
-    height_m: Array, rate: Any, corner: Any, across_y: Walls, across_x: Walls
+    height_m: Array, rate: Any, corners: Corners, across_y: Walls, across_x: Walls
 ) -> tuple[Array, tuple[Any, ...]]:
     reach = max(across_y.reach, across_x.reach)
-    plate = _Plate(jnp.pad(height_m, reach, mode="edge"), jnp.mean(height_m), rate, corner, reach)
+    corners = eqx.tree_at(lambda of: of.weights, corners, weights_within(corners.weights, 0, height_m.shape[1]))
+    plate = _Plate(height_m, jnp.mean(height_m), rate, corners, reach)
 
     def add(number: Any, light: Array) -> Array:
         start = plate.start(number)
@@ -78,12 +80,11 @@ def _forward(
 def _backward(kept: tuple[Any, ...], cotangent: Array) -> tuple[Array, None, None, None, None]:
     plate, across_y, across_x = kept
     reach = across_y.reach, across_x.reach
-    wide = jnp.pad(cotangent, [(one, one) for one in reach])
-    rows, columns = plate.rows, cotangent.shape[1]
+    rows = plate.rows
 
     def add(number: Any, found: tuple[Array, Array]) -> tuple[Array, Array]:
         start = plate.start(number)
-        given = jax.lax.dynamic_slice(wide, (start, 0), (rows + 2 * reach[0], columns + 2 * reach[1]))
+        given = _rows_around(cotangent, start, rows, reach, "constant")
         walls = _walls_of_rows(across_y, across_x, start, plate)
         slope, raised = _slopes_of_rows(plate.cells(start), (given.real, given.imag), start, *walls)
         # The last rows may be those of the strip before, too.
@@ -100,19 +101,19 @@ _light.defvjp(_forward, _backward)
 
 
 class _Plate(eqx.Module):
-    """Heights of a plate, and beyond its rim as many like the last as lie within reach: no walls are there."""
+    """Heights of a plate, and what its light is computed with."""
 
     height_m: Array
     plane_m: Array  # mean height
     rate: Any
-    corner: Any
+    corners: Corners
     reach: int = eqx.field(static=True)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of the plate itself."""
+        """In cells."""
         ny, nx = self.height_m.shape
-        return ny - 2 * self.reach, nx - 2 * self.reach
+        return ny, nx
 
     @property
     def rows(self) -> int:
@@ -129,9 +130,8 @@ class _Plate(eqx.Module):
         return jnp.minimum(strip * self.rows, self.shape[0] - self.rows)
 
     def cells(self, start: Any) -> "_Cells":
-        """Some rows of cells, with those within reach."""
-        size = self.rows + 2 * self.reach, self.height_m.shape[1]
-        height_m = jax.lax.dynamic_slice(self.height_m, (start, 0), size)
+        """Some rows of cells, with those within reach; beyond the rim there are more like the last, and no walls."""
+        height_m = _rows_around(self.height_m, start, self.rows, (self.reach, self.reach), "edge")
 
         def lit(height_m: Array) -> tuple[Array, Array]:
             light = cis(height_m * self.rate)
@@ -139,6 +139,38 @@ class _Plate(eqx.Module):
 
         real, imag = _once(lit, height_m)
         return _Cells(height_m, real, imag, self)
+
+
+def _rows_around(
+    values: Array, start: Any, count: int, reach: tuple[int, int], beyond: Literal["edge", "constant"]
+) -> Array:
+    """Some rows, with what lies around them.
+
+    A plate that were padded as a whole would be one more to have memory for.
+
+    Args:
+        values: of all cells.
+        start: first row.
+        count: rows.
+        reach: cells around them, along y and x.
+        beyond: like the last cells, or 0.
+    """
+    tall = count + 2 * reach[0]
+    size = min(tall, len(values))
+    first = jnp.clip(start - reach[0], 0, len(values) - size)
+
+    def within(values: Array) -> Array:
+        rows = jax.lax.dynamic_slice_in_dim(values, first, size)
+        return jnp.pad(rows, ((0, tall - size), (0, 0)))  # of plates that are no taller, not taken
+
+    def at_the_rim(values: Array) -> Array:
+        rows = jax.lax.dynamic_slice_in_dim(values, first, size)
+        rows = jnp.pad(rows, ((reach[0], reach[0] + tall - size), (0, 0)), mode=beyond)
+        return jax.lax.dynamic_slice_in_dim(rows, start - first, tall)
+
+    inside = (start >= reach[0]) & (start + count + reach[0] <= len(values))
+    rows = jax.lax.cond(inside, within, at_the_rim, values)
+    return jnp.pad(rows, ((0, 0), (reach[1], reach[1])), mode=beyond)
 
 
 def _walls_of_rows(across_y: Walls, across_x: Walls, start: Any, plate: _Plate) -> tuple[Walls, Walls]:
@@ -152,18 +184,18 @@ def _walls_of_rows(across_y: Walls, across_x: Walls, start: Any, plate: _Plate) 
 
 
 def _light_of_rows(around: "_Cells", across_y: Walls, across_x: Walls) -> Array:
-    both = across_y, across_x
+    both, corners = (across_y, across_x), around.plate.corners
 
     def lit(around: _Cells) -> tuple[list[Parts], list[Parts], Parts]:
         lines = [lines_of(around.sides(axis, reach_of(walls.weights)), walls) for axis, walls in enumerate(both)]
         dipoles = [
             dipoles_of(around.sides(axis, reach_of(walls.dipole_weights)), walls) for axis, walls in enumerate(both)
         ]
-        four = around.corners((reach_of(across_y.weights), reach_of(across_x.weights)))
-        return lines, dipoles, each(lambda part: around.plate.corner * part, corner_light(four))
+        four = around.cells_at_corners((reach_of(across_y.weights), reach_of(corners.weights)))
+        return lines, dipoles, each(lambda part: corners.unit * part, corner_light(four))
 
     def with_points(line: Parts, points: Parts) -> Parts:
-        return sum_of([line, to_cells(points, across_x.weights, 1)])
+        return sum_of([line, to_cells(points, corners.weights, 1)])
 
     (along_x, along_y), dipoles, points = _once(lit, around)
     cells = [around.inner()]
@@ -185,7 +217,7 @@ def _slopes_of_rows(
         across_x: the same along x.
     """
     both, plate = (across_y, across_x), around.plate
-    reach, rate = (across_y.reach, across_x.reach), plate.rate
+    reach, rate, corners = (across_y.reach, across_x.reach), plate.rate, plate.corners
     own = tuple(part[reach[0] : -reach[0], reach[1] : -reach[1]] for part in given)
     tall, wide = ([part[:, reach[1] : -reach[1]] for part in given], [part[reach[0] : -reach[0]] for part in given])
 
@@ -201,11 +233,12 @@ def _slopes_of_rows(
         return [slopes_of(around.sides(axis, 1), rate, both[axis], *seen[axis]) for axis in range(2)]
 
     def at_corners(around: _Cells, of_points: Parts) -> list[Array]:
-        return [2 * np.pi * rate * plate.corner * of for of in corner_slopes(around.corners((1, 1)), of_points)]
+        four = around.cells_at_corners((1, 1))
+        return [2 * np.pi * rate * corners.unit * of for of in corner_slopes(four, of_points)]
 
     of_lines, seen = _once(borders, given, tuple(tall), tuple(wide))
     found = _once(slopes, around, seen)
-    of_points = _once(lambda lines: to_borders(lines, across_x.weights, reach[1], 1), of_lines)
+    of_points = _once(lambda lines: to_borders(lines, corners.weights, reach[1], 1), of_lines)
     of_corners = _once(at_corners, around, of_points)
     thin = around.inner()
     slope = -(2 * np.pi * rate) * (own[0] * thin[1] + own[1] * thin[0])
@@ -230,11 +263,26 @@ def _once(function: Callable[..., Any], *arrays: Any) -> Any:
 
     A compiler that fuses loops computes cheap values anew for every neighbour that reads them, ten times here; it
     does not look into a branch. Heights that are not numbers give none of this light, and their own is none either.
+    Arrays of one shape leave the branch two by two as complex ones, for there is one loop for every array, and one
+    for real and imaginary part takes half of the time of two.
     """
-    shapes = jax.eval_shape(function, *arrays)
-    none = lambda *_: jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)  # noqa: E731
-    first = jax.tree.leaves(arrays)[0]
-    return jax.lax.cond(jnp.isfinite(first[0, 0]), function, none, *arrays)
+    shapes, structure = jax.tree.flatten(jax.eval_shape(function, *arrays))
+    pairs, first = [], 0
+    while first < len(shapes):
+        alike = first + 1 < len(shapes) and shapes[first].shape == shapes[first + 1].shape
+        pairs.append(slice(first, first + 1 + alike))
+        first += 1 + alike
+
+    def joined(*arrays: Any) -> list[Array]:
+        found = jax.tree.leaves(function(*arrays))
+        return [jax.lax.complex(*of) if len(of) == 2 else of[0] for of in (found[pair] for pair in pairs)]
+
+    def none(*arrays: Any) -> list[Array]:
+        return [jnp.zeros(one.shape, one.dtype) for one in jax.eval_shape(joined, *arrays)]
+
+    some = jax.lax.cond(jnp.isfinite(jax.tree.leaves(arrays)[0][0, 0]), joined, none, *arrays)
+    parts = [part for one in some for part in ((one.real, one.imag) if jnp.iscomplexobj(one) else (one,))]
+    return jax.tree.unflatten(structure, parts)
 
 
 class _Cells(eqx.Module):
@@ -263,7 +311,7 @@ class _Cells(eqx.Module):
         before, behind = zip(pair(self.real), pair(self.imag), strict=True)
         return Sides(low, high, before, behind, self.plate.plane_m)
 
-    def corners(self, reach: tuple[int, int]) -> Four:
+    def cells_at_corners(self, reach: tuple[int, int]) -> Four:
         """The cells at all corners, and at as many beyond the ends of either axis as lie within a shorter reach."""
         own, turn = self.plate.reach, 2 * np.pi * self.plate.rate
         ny, nx = (n - 2 * own + 2 * one - 1 for n, one in zip(self.height_m.shape, reach, strict=True))

@@ -35,7 +35,7 @@ from sim.optic import HeightOptic, ViewedOptic
 from sim.propagation.oblique import oblique_waves
 from sim.rigorous.cells_and_walls import light_of_cells_and_walls
 from sim.rigorous.corner_light import corner_unit
-from sim.rigorous.walls import Walls
+from sim.rigorous.walls import Corners, Walls
 from sim.rigorous.width_tables import edge_table, highest_wall, two_waves
 from sim.source import SeparableSource, SourceMap, View
 from sim.tracing import is_traced
@@ -43,6 +43,7 @@ from sim.tracing import is_traced
 # Root mean square error of a line's far field that is good enough, and the largest that is borne before cells are
 # split; lines are about a tenth of the light.
 _GOOD, _WORST, _MOST_TAPS = 0.003, 0.03, 10
+_GOOD_POINT = 0.05  # of points at corners, which are a hundredth of the light
 _GOOD_DIPOLE = 0.08  # of dipoles, over their own
 _WIDEST_LIGHT = 0.2  # waves per cell from a far to a near source's light on the rim, for which dipoles of one view do
 _SHARES = 33  # of the way from the axis to the rim, for which weights are fitted
@@ -152,8 +153,9 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
             own = _at_borders(taps[0], camera, axis), _at_borders(taps[1], camera, axis)
             walls.append(Walls.of(table, highest, index / wavelength, own, camera.grid.pitch_m))
         rate = camera.waves_per_metre(wavelength)
-        corner = corner_unit(wavelength, index) / camera.grid.pitch_m**2
-        found.append(light_of_cells_and_walls(height, rate, corner, *walls))
+        points = _at_borders(line_weights(*waves, camera.opening, _GOOD_POINT)[0], camera, "x")
+        corners = Corners.of(corner_unit(wavelength, index) / camera.grid.pitch_m**2, points)
+        found.append(light_of_cells_and_walls(height, rate, corners, *walls))
     coverage = jnp.asarray(open_cells(camera.grid, camera.opening))
     return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), tuple(views), wavelengths, depths)
 
@@ -191,7 +193,7 @@ def optic_as_drawn(
 
 @lru_cache(maxsize=64)
 def line_weights(
-    seen: float, low: float, high: float, aperture: Aperture
+    seen: float, low: float, high: float, aperture: Aperture, good: float = _GOOD
 ) -> tuple[Inexact[np.ndarray, "node tap"], float]:
     """Weights on the cells to either side of a line whose far field is that of the line.
 
@@ -205,17 +207,18 @@ def line_weights(
         low: wave number of the light of the farthest source on a cell at the rim.
         high: the same of the nearest.
         aperture: the clear aperture, whose lines are as long as it is where they lie.
+        good: error that may be left.
 
     Returns:
         the weights for shares from 0 to 1, and the root mean square of their error over DOE and window. As few as leave
-        an error of 0.3 %, ten on either side at most. Real ones for distant sources.
+        that error, ten on either side at most. Real ones for distant sources.
     """
     share = np.linspace(0, 1, _SHARES)
     waves = np.linspace(-seen - share * high, seen - share * low, 300)  # [wave, node]
     weights, error = np.zeros((_SHARES, 2), complex), np.inf
     for reach in range(1, _MOST_TAPS + 1):
         weights, error = _fitted(waves.T, np.ones_like(waves.T), reach, np.ones(_SHARES), aperture)
-        if error <= _GOOD:
+        if error <= good:
             break
     return (np.real(weights) if low == high == 0 else weights), error
 

@@ -75,6 +75,29 @@ class Walls(eqx.Module):
         return max(reach_of(self.weights), reach_of(self.dipole_weights))
 
 
+class Corners(eqx.Module):
+    """Points of light where walls of both axes meet.
+
+    Attributes:
+        unit: of their light (`sim.rigorous.corner_light.corner_unit`), over the pitch squared.
+        weights: `[part, tap, border]` share of the cells along x in the light of a point, as of `Walls`; along y it is
+            that of a wall.
+    """
+
+    unit: Any
+    weights: Float[Array, "part few own"]
+
+    @classmethod
+    def of(cls, unit: float, weights: Inexact[np.ndarray, "tap border"]) -> "Corners":
+        """Points.
+
+        Args:
+            unit: of their light.
+            weights: for every border along x.
+        """
+        return cls(unit, _in_parts(weights))
+
+
 def reach_of(weights: Float[Array, "part tap own"]) -> int:
     """Cells to either side of a border that weights reach.
 

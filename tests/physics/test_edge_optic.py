@@ -22,7 +22,7 @@ from sim.rigorous.corner_light import corner_unit
 from sim.rigorous.edge_optic import dipole_weights, line_weights, optic_as_drawn, with_edges
 from sim.rigorous.edge_widths import edge_dipoles, series_at
 from sim.rigorous.rows import Polarisation
-from sim.rigorous.walls import Walls
+from sim.rigorous.walls import Corners, Walls
 from sim.rigorous.width_tables import edge_table
 
 PITCH, STEP, WAVELENGTH = 1.85e-6, 75e-9, 0.552e-6
@@ -223,11 +223,12 @@ def test_slopes_of_the_light_of_walls_are_those_of_differences(oblique: bool):
     walls = [Walls.of(one, 1.2e-6, INDEX / WAVELENGTH, some, PITCH) for one in tables]
     rng = np.random.default_rng(0)
     height, rate = jnp.asarray(rng.uniform(0, 1.1e-6, (8, 8)), jnp.float32), (INDEX - 1) / WAVELENGTH
-    corner = corner_unit(WAVELENGTH, INDEX) / PITCH**2
+    points, _ = line_weights(0.3, 0.0, 0.28 * oblique, RoundAperture(1.0), 0.05)
+    corners = Corners.of(corner_unit(WAVELENGTH, INDEX) / PITCH**2, points[4:32:4].T)
     seen = jnp.asarray(rng.normal(size=(8, 8)) + 1j * rng.normal(size=(8, 8)), jnp.complex64)
 
     def amount(height: jax.Array) -> jax.Array:
-        return jnp.sum(seen * light_of_cells_and_walls(height, rate, corner, *walls)).real
+        return jnp.sum(seen * light_of_cells_and_walls(height, rate, corners, *walls)).real
 
     slopes = np.asarray(jax.grad(amount)(height)) * 1e-9
     steps = 1e-9 * np.eye(64, dtype=np.float32).reshape(64, 8, 8)
@@ -245,6 +246,7 @@ def test_a_plate_is_the_same_a_few_rows_at_a_time(rows: int, monkeypatch: pytest
     own = [(of_lines[at].T, of_dipoles[at].T) for at in borders]
     tables = [edge_table(1.125e-6, WAVELENGTH, INDEX, "x", axis) for axis in ("y", "x")]
     walls = [Walls.of(of, 1.125e-6, INDEX / WAVELENGTH, w, PITCH) for of, w in zip(tables, own, strict=True)]
+    corners = Corners.of(0.01, line_weights(0.3, 0.0, 0.28, RoundAperture(1.0), 0.05)[0][borders[1]].T)
     rng, rate = np.random.default_rng(5), (INDEX - 1) / WAVELENGTH
     height = jnp.asarray(rng.uniform(0, 1.1e-6, (8, 6)), jnp.float32)
     seen = jnp.asarray(rng.normal(size=(8, 6)) + 1j * rng.normal(size=(8, 6)), jnp.complex64)
@@ -252,7 +254,7 @@ def test_a_plate_is_the_same_a_few_rows_at_a_time(rows: int, monkeypatch: pytest
     def found() -> tuple[np.ndarray, np.ndarray]:
         # Not the compiled one, which remembers how many rows it took.
         uncompiled = inspect.unwrap(light_of_cells_and_walls)
-        light, back = jax.vjp(jax.jit(lambda h: uncompiled(h, rate, 0.01, *walls)), height)
+        light, back = jax.vjp(jax.jit(lambda h: uncompiled(h, rate, corners, *walls)), height)
         return np.asarray(light), np.asarray(back(seen)[0])
 
     whole = found()
