@@ -1,6 +1,7 @@
 """A larger aperture whose depth of field the plate buys back: what it is worth behind dirt, measured with its rivals.
 
-    python examples/wide_aperture.py [--images DIR ...] [--judged DIR ...] [--out runs/wide_aperture]
+    python examples/wide_aperture.py [--images DIR ...] [--judged DIR ...] [--behind bars] [--steps 0]
+        [--out runs/wide_aperture]
 
 Four cameras of 16 mm look at scenes from 2 m to infinity through dirt 4 to 6 mm wide, at 5 to 12 cm: stopped down
 to 4.44 mm, at f/2, at f/1.4, and at f/1.4 with the plate of `wide_aperture.toml`. All expose as long, so that the stop
@@ -8,7 +9,8 @@ gets 0.15 of the light. The dirt is known as one knows it in practice, with erro
 off, what it keeps back is made up for, and a network gets the result and the share of light that passed. Everyone has
 the same network and training, on scenes of random depth that it is not told (it has the PSF of the middle depth),
 judged by PSNR of the covered part at 2 m, 4 m and infinity; the plate as drawn and as fabricated. Beside it stands one
-linear filter for all depths, without training. Written to OUT:
+linear filter for all depths, without training; `--steps 0` has it alone. `--behind bars` has straight bars of 4 mm at
+8 cm, 12 to 16 mm apart, in place of dirt. Written to OUT:
 
     design/             the run of the plate
     plates.json         what one filter for all depths leaves: plain lens, classic plates, the plate
@@ -75,6 +77,16 @@ DRAWS = 3  # plates as fabricated
 _AGAIN = "Remove it; it is computed again."
 
 
+# Words that put something else before the cameras than the dirt of the spec.
+BEHIND: Mapping[str, Sequence[str]] = {
+    "dirt": (),
+    "bars": (
+        'obstruction.kind="fence"',
+        'obstruction.options={ patterns = ["bars"], depth = "8 cm", wire = "4 mm", mesh = ["12 mm", "16 mm"] }',
+    ),
+}
+
+
 class CameraKind(NamedTuple):
     """A camera of the comparison: cells over its aperture, parts across, and whether it has the plate."""
 
@@ -101,10 +113,11 @@ class Plan:
         size: pixels per side of a picture, a multiple of 8, at least 40.
         scenes: scenes to train on.
         judged: scenes to judge by.
-        steps: training steps.
+        steps: training steps; 0 for no network.
         batch: scenes per step.
         width: features of the network's finest scale.
         seed: of everything random.
+        behind: what all scenes are behind, a key of `BEHIND`.
     """
 
     size: int = 128
@@ -114,11 +127,12 @@ class Plan:
     batch: int = 2
     width: int = 16
     seed: int = 1
+    behind: str = "dirt"
 
 
 def scenes_of(pictures: Pictures, plan: Plan, count: int, stream: int) -> list[DirtyScene]:
-    """Scenes behind the dirt of the spec; streams are apart."""
-    spec = load_spec(SPEC)
+    """Scenes behind dirt or bars; streams are apart."""
+    spec = load_spec(SPEC, BEHIND[plan.behind])
     kind = obstruction_from_spec(spec, str(SPEC))
     return list(dirty_scenes(pictures, camera_from_spec(spec), kind, plan.size, count, (plan.seed, stream)))
 
@@ -328,14 +342,14 @@ class Judged(NamedTuple):
 
 def judge(
     bench: Bench,
-    network: Network,
+    network: Network | None,
     scenes: Sequence[DirtyScene],
     plan: Plan,
     plate: str,
     lights: Sequence[float],
     at: Bench,
 ) -> tuple[list[Judged], dict[Any, np.ndarray]]:
-    """Judge a camera; `at` has the PSFs that take the pictures, `bench` those that one knows of.
+    """Judge a camera, its network and one filter; `at` has the PSFs that take the pictures, `bench` those one knows of.
 
     Returns the scores, and capture and reconstruction of every scene and depth in the first of `lights`.
     """
@@ -349,12 +363,13 @@ def judge(
                 for brightness in lights:
                     raw = taken(light, bench.sensor(brightness), noise_key(plan, 1, number))
                     seen = bench.corrected(raw, scene, depth)
-                    found = {"network": np.asarray(_look(network, seen[None], far))[0], "filter": filtered(seen, bench)}
+                    found = {} if network is None else {"network": np.asarray(_look(network, seen[None], far))[0]}
+                    found["filter"] = filtered(seen, bench)
                     for way, picture in found.items():
                         value = float(psnr(picture[None], wanted, scene.covered[None])[0])
                         rows.append(Judged(bench.kind.name, plate, way, brightness, depth, number, value))
                     if brightness == lights[0]:
-                        shots = (np.clip(srgb_from_linear(raw), 0, 1), np.clip(found["network"], 0, 1))
+                        shots = np.clip(srgb_from_linear(raw), 0, 1), np.clip(next(iter(found.values())), 0, 1)
                         pictures[number, depth] = np.stack(shots)
             progress.advance(number + 1, "")
     return rows, pictures
@@ -442,11 +457,15 @@ def summary_of(rows: Sequence[Judged]) -> dict[str, Any]:
     return {"scores": table, "worst depth, plate over rival": differences}
 
 
-def draw(path: Path, scenes: Sequence[DirtyScene], shown: Mapping[str, Mapping[Any, np.ndarray]], edge: int) -> None:
-    """Draw some scenes and their dirt, and every camera's capture and reconstruction, at infinity."""
+def draw(
+    path: Path, scenes: Sequence[DirtyScene], shown: Mapping[str, Mapping[Any, np.ndarray]], edge: int, plan: Plan
+) -> None:
+    """Draw some scenes and what they are behind, and every camera's capture and reconstruction, at infinity."""
     chosen = range(min(3, len(scenes)))
-    note = "Scene at infinity, dirt 4 to 6 mm wide; for each camera the capture, and what its network makes of it."
-    with panels(None, (1.5 * (2 + len(shown)), 3.1 * len(chosen)), "A wide aperture behind dirt", note) as figure:
+    found = "its network" if plan.steps else "one filter"
+    note = f"Scene at infinity, {plan.behind} before it; for each camera the capture, and what {found} makes of it."
+    title = f"A wide aperture behind {plan.behind}"
+    with panels(None, (1.5 * (2 + len(shown)), 3.1 * len(chosen)), title, note) as figure:
         grid = figure.subplots(2 * len(chosen), 1 + len(shown))
         for row, number in enumerate(chosen):
             scene = scenes[number]
@@ -477,7 +496,7 @@ def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
     optimize(SPEC, out / "design")
     design = open_design(out / "design")
     classic_plates(design, out)
-    training = scenes_of(pools[0], plan, plan.scenes, 0)
+    training = scenes_of(pools[0], plan, plan.scenes if plan.steps else 0, 0)
     seen = scenes_of(pools[1], plan, plan.judged, 1)
     rows: list[Judged] = []
     shown: dict[str, dict[Any, np.ndarray]] = {}
@@ -486,7 +505,7 @@ def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
         folder = out / kind.name
         drawn = partial(_drawn, kind, design)
         bench = Bench(kind, plan.size, folder, drawn)
-        network = trained(bench, training, plan, folder)
+        network = trained(bench, training, plan, folder) if plan.steps else None
         edge = (bench.camera.window - 1) // 2
         found, shown[kind.name] = judge(bench, network, seen, plan, "drawn", (1.0, 0.1), bench)
         rows += found
@@ -497,7 +516,7 @@ def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
         write_atomic(out / "scores.csv", csv_table(rows, 6).encode())
     found = summary_of(rows)
     write_atomic(out / "summary.json", canonical_json(found))
-    draw(out / "wide_aperture.png", seen, shown, edge)
+    draw(out / "wide_aperture.png", seen, shown, edge, plan)
     return found
 
 
@@ -521,6 +540,7 @@ def main() -> int:
     for name in ("size", "scenes", "judged-scenes", "steps", "batch", "width"):
         field = "judged" if name == "judged-scenes" else name
         parser.add_argument(f"--{name}", type=int, default=getattr(Plan(), field), dest=f"plan_{field}")
+    parser.add_argument("--behind", choices=sorted(BEHIND), default=Plan().behind, dest="plan_behind")
     parser.add_argument("--out", type=Path, default=Path("runs/wide_aperture"))
     given = parser.parse_args()
 

@@ -550,7 +550,7 @@ def test_areas_that_cannot_be_are_named_by_their_number(tmp_path: Path, areas: l
         (['area.shape="line"'], "area", "a width or a height"),
         (['area.width="3 mm"'], "area", "light places up to 1157 um"),
         (['sensor.defocus="20 mm"'], "sensor.defocus", "between"),
-        (['optimize.start="random"'], "optimize.start", "starts and levels of their own"),
+        (['optimize.start="random"'], "optimize.start", "starts, steps and levels of their own"),
         (['scene.far=["1 m"]'], "scene.far", "collimated"),
         (['spots={ count = [3, 3], spacing = "50 um" }'], "area", "takes the place of spots"),
         (['objective=[{ name = "window_loss" }]'], "area", "takes the place of objectives"),

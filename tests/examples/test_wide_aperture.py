@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from sim.source import path_at_m
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
+import dirty_scenes  # pyright: ignore[reportMissingImports]
 import wide_aperture  # pyright: ignore[reportMissingImports]
 
 
@@ -58,6 +60,18 @@ def test_scenes_are_about_dirt_and_what_is_believed_of_it_is_off():
         assert 0 < np.mean(np.abs(scene.believed - scene.blocked)) < 0.2
 
 
+def test_bars_are_straight_and_at_one_distance():
+    """4 mm at 8 cm are 216 pixels of 3.7 um; coarse ones are eight of them wide."""
+    pictures = Pictures(sample_files()[:1], 256)
+    for scene in wide_aperture.scenes_of(pictures, wide_aperture.Plan(size=32, behind="bars"), 3, 0):
+        assert scene.near_m == pytest.approx(0.08)
+        share = float(np.mean(scene.blocked))
+        # 4 of 12 to 16 mm; the layer is one and a half to two meshes wide, with a bar in its middle.
+        assert 0.2 < share < 0.5
+        middle = scene.blocked[dirty_scenes.DIRT_PX // 2, dirty_scenes.DIRT_PX // 2]
+        assert middle > 0.4
+
+
 def test_the_spec_says_what_is_designed():
     spec = load_spec(wide_aperture.SPEC)
     assert (spec.optimize.parametrization, spec.process.levels) == ("radial", 16)
@@ -89,3 +103,5 @@ def test_the_whole_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert (tmp_path / "out" / "wide_aperture.png").stat().st_size > 10_000
     assert "plate / fabricated 0 / network / 1.0 over stop" in found["worst depth, plate over rival"]
     assert wide_aperture.run(tmp_path / "out", plan, files[:2], files[2:4]) == found
+    alone = wide_aperture.run(tmp_path / "bars", replace(plan, steps=0, behind="bars"), files[:2], files[2:4])
+    assert all(" / filter / " in name for name in alone["scores"])

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 _OWN = (
     ("parametrization", "freeform"),
     ("start", "flat"),
+    ("learning_rate", 0.1),
     ("quantisation", "straight_through"),
+    ("sampling", "sparse"),
     ("colours", "together"),
     ("polish", 0),
     ("min_feature_m", None),
@@ -40,7 +42,7 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
         yield InputError("process.etch_depths", "the depths must be known", '"optimize"', "Give them, or leave it out.")
     for name, usual in _OWN:
         if (got := getattr(spec.optimize, name)) != usual:
-            rule = "spots, areas and foci have starts and levels of their own"
+            rule = "spots, areas and foci have starts, steps and levels of their own"
             yield InputError(f"optimize.{toml_key(name)}", rule, f'"{got}"', "Leave it out.")
 
 
