@@ -67,7 +67,7 @@ def candidates_of(
     ready: list[Candidate] = []
     left: list[Unscored] = []
     for row in rows:
-        why = next((missing[name] for name in (row.training, row.plate) if name and name in missing), "")
+        why = next((missing[name] for name in row.needs if name in missing), "")
         alone = row.training is None and row.plate == FLAT
         found = []
         for seed in () if why else (0,) if alone else seeds:

@@ -10,7 +10,6 @@ from doedesign.design.design import Design
 from doedesign.evaluation.pairs import PairSet
 from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow
 from doedesign.evaluation.trainings import TrainingPlan
-from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from fab.draws import sources_of
 from fab.errors import InputError
@@ -75,14 +74,14 @@ def plates_of(
         InputError: the process cannot be read, or makes another staircase.
     """
     camera, depths = pairs.model.camera, pairs.depths_m
-    named = {row.plate for row in rows} - {FLAT, *missing}
+    named = {row.plate for row in rows if not missing.keys() & set(row.needs)} - {FLAT}
     made = {row.plate for row in rows if row.fabricated}
     wanted = [(name, seed) for name in sorted(named) for seed in seeds]
     found = {FLAT: PlateBanks(psf(HeightOptic.of(camera), camera, depths))}
     with meter("computing PSFs", 1 + len(wanted)) as progress:
         for count, (name, seed) in enumerate(wanted, 1):
             progress.advance(count)
-            design = open_design(plan.folder(TRAININGS[name], seed), False)
+            design = plan.plate(TRAININGS[name], seed)
             drawn = psf(optic_as_drawn(camera, design.level_map.height_m, depths_m=depths), camera, depths)
             banks = PlateBanks(drawn)
             if name in made:

@@ -17,6 +17,8 @@ from fab.errors import InputError
 FLAT = "flat"
 ROBUST = "robust"
 
+_STILL = 'train.freeze="optics"'
+
 Sees = Literal["capture", "scene"]
 
 
@@ -40,6 +42,11 @@ class Training:
     def after(self) -> str | None:
         """Name of the training that comes before, whose plate this one stands behind; None without one."""
         return None if self.plate == FLAT else self.plate
+
+    @property
+    def keeps_plate(self) -> bool:
+        """Whether the plate stays that of the design it begins with, so that there is one without the training."""
+        return self.plate is None and _STILL in self.changes
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,12 @@ class MethodRow:
     told: Literal["right", "drawn"] = "right"
     paper: str | None = None
 
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the trainings that it needs: that of its method, and that of its plate if that moves it."""
+        moved = self.plate != FLAT and not TRAININGS[self.plate].keeps_plate
+        return (*((self.training,) if self.training else ()), *((self.plate,) if moved else ()))
+
 
 TRAININGS = {
     one.name: one
@@ -76,11 +89,11 @@ TRAININGS = {
         Training("no_inverse_filter", ("network.wiener=false",)),
         Training("no_residual_block", ("network.refine=false",)),
         Training("no_feature_extraction", ("network.features=false",)),
-        Training("sequential", ('train.freeze="optics"',)),
+        Training("sequential", (_STILL,)),
         Training("conventional", ('train.camera="conventional"',)),
         # Whatever the other trainings are asked for: here no network learns.
         Training("optics_only", ('train.freeze="network"', "train.light_scenes=0")),
-        Training(ROBUST, ('train.freeze="optics"',)),
+        Training(ROBUST, (_STILL,)),
         Training("pyramid_deblurring", rival="pyramid_deblurring", plate="proposed"),
         Training("plain_unet", rival="plain_unet", plate="proposed"),
         Training("fourier_inpainting", rival="fourier_inpainting", plate=FLAT),
@@ -212,7 +225,6 @@ def rows_of(table: int, obstruction: str, *, robust: bool = False, names: Sequen
 
 def trainings_of(rows: Sequence[MethodRow]) -> tuple[Training, ...]:
     """Trainings that rows need, those first that others stand behind."""
-    asked = [row.training for row in rows if row.training] + [row.plate for row in rows if row.plate != FLAT]
     needed: dict[str, Training] = {}
 
     def add(name: str) -> None:
@@ -221,6 +233,7 @@ def trainings_of(rows: Sequence[MethodRow]) -> tuple[Training, ...]:
             add(one.after)
         needed[name] = one
 
-    for name in asked:
-        add(name)
+    for row in rows:
+        for name in row.needs:
+            add(name)
     return tuple(needed.values())

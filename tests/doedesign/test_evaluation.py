@@ -22,7 +22,7 @@ from doedesign.evaluation.evaluate import evaluate
 from doedesign.evaluation.external import ExternalMethod
 from doedesign.evaluation.methods import METHODS, MethodInputs, as_seen
 from doedesign.evaluation.pairs import PairSet
-from doedesign.evaluation.plates import PlateBanks
+from doedesign.evaluation.plates import PlateBanks, plates_of
 from doedesign.evaluation.published import TABLE_1, TABLE_2
 from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow, rows_of, trainings_of
 from doedesign.evaluation.statistics import BootstrapInterval, bootstrap_mean
@@ -245,6 +245,22 @@ def test_rows_are_named_once_and_their_trainings_are_known():
         for name in needed:  # a plate is there before the network behind it
             plate = TRAININGS[name].plate
             assert plate in (None, FLAT) or needed.index(plate) < needed.index(name)
+
+
+def test_a_plate_that_no_training_moves_takes_none(run: Path, tmp_path: Path):
+    """It is looked through without; a network behind it takes one."""
+    rows = rows_of(2, "dirt", robust=True, names=("robust_capture", "conventional_capture"))
+    assert trainings_of(rows) == ()
+    behind = rows_of(2, "dirt", robust=True, names=("robust", "capture"))
+    assert {one.name for one in trainings_of(behind)} == {"proposed", "robust"}
+    assert [one.name for one in trainings_of(rows_of(1, "dirt", names=("sequential",)))] == ["sequential"]
+    plan = TrainingPlan(run, tmp_path, "paper", "dirt", robust=run)
+    pairs = PairSet.of(load_spec(run / "spec.toml"), "spec.toml", sample_files()[:1])
+    plates = plates_of(rows, plan, pairs, (0,), {}, None, 0)
+    assert plates.keys() == {FLAT, "robust@0"}
+    ready, left = candidates_of(rows, plan, (0,), {}, plates, sample_files()[:1])
+    assert [one.row.name for one in ready] == ["robust_capture", "conventional_capture"]
+    assert not left
 
 
 def test_changes_of_trainings_are_changes_that_a_spec_takes(run: Path):
