@@ -11,6 +11,8 @@ their rates leave out the start.
 
 import argparse
 import resource
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -100,11 +102,15 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--quick", action="store_true", help="a small plate, in a minute")
-    quick = parser.parse_args().quick
-    design, process = make_task(600 if quick else 2400)
-    for light in get_args(Light):
-        time_draws(replace(design, camera=replace(design.camera, light=light)), process, rounds=3)
-    time_workers(*make_task(600))
+    parser.add_argument("--light", choices=get_args(Light), help="draws in this light alone")
+    given = parser.parse_args()
+    if given.light is None:
+        for light in get_args(Light):  # in processes of their own, so that each has its own peak
+            subprocess.run([sys.executable, "-m", "bench.plate", "--light", light, *sys.argv[1:]], check=True)
+        time_workers(*make_task(600))
+    else:
+        design, process = make_task(600 if given.quick else 2400)
+        time_draws(replace(design, camera=replace(design.camera, light=given.light)), process, rounds=3)
 
 
 if __name__ == "__main__":
