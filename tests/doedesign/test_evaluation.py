@@ -652,7 +652,7 @@ def test_the_command_prints_where_the_table_is(run: Path, tmp_path: Path):
     code, said, told = call("evaluate", run, "--pairs", 1, "--workers", 0, "--out", tmp_path / "out")
     assert code == 0, told
     assert str(tmp_path / "out/table2-dirt-paper/table.csv") in said.splitlines()
-    assert "conventional capture" in told
+    assert "Conventional capture" in told
     for options, words in (
         (("--table", 3), "must be 1 or 2"),
         (("--pairs", 0), "must be at least 1"),
