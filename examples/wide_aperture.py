@@ -40,11 +40,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import scipy.ndimage
-from dirty_scenes import DirtyScene, believed_shadow, corrected, dirty_scenes, light_of
+import wide_cameras as cameras
+from dirty_scenes import DirtyScene, dirty_scenes, light_of
 
 from doedesign.build import camera_from_spec
-from doedesign.capture.from_spec import obstruction_from_spec, sensor_from_spec
+from doedesign.capture.from_spec import obstruction_from_spec
 from doedesign.capture.images import Pictures, picture_files, sample_files
 from doedesign.cli import exit_code
 from doedesign.design.design import Design
@@ -62,20 +62,11 @@ from doedesign.training.scores import mean_and_interval, paired_difference, psnr
 from fab.archive import read_archive, write_archive
 from fab.figure import SMALL, panels, save
 from fab.files import canonical_json, csv_table, write_atomic
-from sim.camera import Camera
-from sim.imaging.filtering import common_filter, photograph_spectrum, transfers
-from sim.imaging.parts import ApertureParts, aperture_parts
 from sim.light import srgb_from_linear
 from sim.optic import CellOptic, HeightOptic
 from sim.psf_bank import psf
-from sim.sensor import Sensor, developed, expose
 
-SPEC = Path(__file__).parent / "wide_aperture.toml"
-DATA = Path(__file__).parents[2] / "shared" / "data"
-JUDGED_M = (2.0, 4.0, np.inf)
 DRAWS = 3  # plates as fabricated
-_AGAIN = "Remove it; it is computed again."
-
 
 # Words that put something else before the cameras than the dirt of the spec.
 BEHIND: Mapping[str, Sequence[str]] = {
@@ -85,24 +76,6 @@ BEHIND: Mapping[str, Sequence[str]] = {
         'obstruction.options={ patterns = ["bars"], depth = "8 cm", wire = "4 mm", mesh = ["12 mm", "16 mm"] }',
     ),
 }
-
-
-class CameraKind(NamedTuple):
-    """A camera of the comparison: cells over its aperture, parts across, and whether it has the plate."""
-
-    name: str
-    aperture: str
-    samples: int
-    across: int
-    plate: bool = False
-
-
-CAMERAS = (
-    CameraKind("stop", "4.44 mm", 584, 3),
-    CameraKind("f2", "8 mm", 1053, 5),
-    CameraKind("open", "11.4 mm", 1500, 7),
-    CameraKind("plate", "11.4 mm", 1500, 7, plate=True),
-)
 
 
 @dataclass(frozen=True)
@@ -132,8 +105,8 @@ class Plan:
 
 def scenes_of(pictures: Pictures, plan: Plan, count: int, stream: int) -> list[DirtyScene]:
     """Scenes behind dirt or bars; streams are apart."""
-    spec = load_spec(SPEC, BEHIND[plan.behind])
-    kind = obstruction_from_spec(spec, str(SPEC))
+    spec = load_spec(cameras.SPEC, BEHIND[plan.behind])
+    kind = obstruction_from_spec(spec, str(cameras.SPEC))
     return list(dirty_scenes(pictures, camera_from_spec(spec), kind, plan.size, count, (plan.seed, stream)))
 
 
@@ -142,110 +115,16 @@ def noise_key(plan: Plan, stream: int, number: int) -> Any:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(plan.seed), stream), number)
 
 
-def camera_of(kind: CameraKind) -> tuple[Camera, Spec]:
-    """The lens and sensor of a camera, with an odd window, and its spec."""
-    spec = load_spec(SPEC, [f"doe.samples={kind.samples}", f'doe.aperture="{kind.aperture}"'])
-    return replace(camera_from_spec(spec), window=spec.sensor.window | 1), spec
-
-
-class Bench:
-    """A camera of the comparison: its light by parts of the aperture at every depth, and its sensor.
-
-    Attributes:
-        kind: which camera.
-        camera: lens and sensor.
-        size: pixels per side of a picture, a multiple of 8, at least 40.
-        spec: its spec.
-    """
-
-    def __init__(self, kind: CameraKind, size: int, folder: Path, make: Any) -> None:
-        self.kind, self.size = kind, size
-        self.camera, self.spec = camera_of(kind)
-        self._make, self._folder = make, folder
-        self._kept: dict[float, tuple[ApertureParts, list[Any]]] = {}
-        self._filters: dict[int, np.ndarray] = {}
-        self._shadows: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
-
-    def at(self, depth_m: float) -> tuple[ApertureParts, list[Any]]:
-        """Parts of the PSF for a depth, and their transforms; computed once and kept in a file."""
-        if depth_m not in self._kept:
-            path = self._folder / f"parts_{depth_m:g}.npz"
-            if path.is_file():
-                _, arrays = read_archive(path, "parts of an aperture", _AGAIN)
-                parts = ApertureParts(arrays["psf"], arrays["centre_m"], arrays["side_m"], self.camera, depth_m)
-            else:
-                parts = aperture_parts(self._make(), depth_m, self.kind.across)
-                if not self.kind.plate:  # a lens without a plate has no faces of glass that reflect
-                    lost = [line.factor for line in self.camera.lines]
-                    parts = replace(parts, psf=parts.psf / np.array(lost, np.float32)[:, None, None])
-                self._folder.mkdir(parents=True, exist_ok=True)
-                arrays = {"psf": parts.psf, "centre_m": parts.centre_m, "side_m": parts.side_m}
-                write_archive(path, {"format": "parts of an aperture 1"}, arrays)
-            side = self.size + self.camera.window - 1
-            self._kept[depth_m] = parts, parts.otfs((side, side))
-        return self._kept[depth_m]
-
-    def corrected(self, light: np.ndarray, scene: DirtyScene, depth_m: float) -> np.ndarray:
-        """A capture with the believed dirt taken off (`corrected`), as this camera's PSFs for a depth say it."""
-        parts, key = self.at(depth_m)[0], (scene.key, depth_m)
-        if key not in self._shadows:
-            self._shadows[key] = believed_shadow(scene, parts, self.size)
-        return corrected(light, self._shadows[key], parts.whole.sum(axis=(1, 2)))
-
-    def sensor(self, brightness: float = 1.0) -> Sensor:
-        """The sensor after the same time for every camera: the widest aperture fills the stated share of its well."""
-        plain = sensor_from_spec(self.spec)
-        widest = max(camera_of(kind)[0].aperture_m for kind in CAMERAS)
-        return replace(plain, exposure=plain.exposure * brightness * (self.camera.aperture_m / widest) ** 2)
-
-    def filter(self, side: int) -> np.ndarray:
-        """The best linear filter for all depths, `[c, fy, fx]`, for pictures of an even `side`, in daylight."""
-        if side not in self._filters:
-            psfs = np.stack([self.at(depth)[0].whole for depth in depths_of(self.spec)], axis=1)
-            window = psfs.shape[-1]
-            wide = np.zeros((*psfs.shape[:2], side, side), np.float32)
-            wide[..., :window, :window] = psfs / psfs.sum(axis=(-2, -1), keepdims=True)
-            transfer = transfers(np.roll(wide, (side // 2 - window // 2,) * 2, axis=(-2, -1)))
-            # The middle of an even window lies half a pixel before the middle pixel of what was put there.
-            waves = np.fft.fftfreq(side)[:, None] + np.fft.rfftfreq(side)
-            white = float(self.sensor().white_e(3).mean())
-            # Half of a picture as bright as 0.3 of white passes.
-            variance = 0.3 / (0.5 * white) + (self.sensor().read_noise_e / (0.5 * white)) ** 2
-            transfer = transfer * np.exp(1j * np.pi * waves)
-            found = common_filter(transfer, photograph_spectrum(side, 0.05), variance / side**2)
-            self._filters[side] = np.array(found)
-            self._filters[side][..., 0, 0] = 1.0  # the mean is known
-        return self._filters[side]
-
-    def told(self) -> np.ndarray:
-        """PSFs that the network is told, those of the middle depth; nothing blurs the share that passed."""
-        whole = self.at(JUDGED_M[1])[0].whole
-        still = np.zeros_like(whole[:1])
-        still[0, whole.shape[1] // 2, whole.shape[2] // 2] = 1.0
-        # What is lost has been made up for.
-        return np.concatenate([whole / whole.sum(axis=(1, 2), keepdims=True), still])
-
-
-def taken(light: np.ndarray, sensor: Sensor, key: Any) -> np.ndarray:
-    """A developed capture of light, with noise."""
-    return np.asarray(developed(expose(jnp.asarray(light), sensor, key), sensor))
-
-
-def depths_of(spec: Spec) -> tuple[float, ...]:
-    """Depths of the scenes to train on."""
-    return tuple(spec.scene.far_m)
-
-
 def training_light(
-    bench: Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path
+    bench: cameras.Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path
 ) -> tuple[np.ndarray, list[float]]:
     """Light of all scenes to train on, `[scene, c, y, x]`, and the depth of each; kept in a file."""
     choose = np.random.default_rng((plan.seed, 9))
-    all_depths = depths_of(bench.spec)
+    all_depths = cameras.depths_of(bench.spec)
     depths = [all_depths[k] for k in choose.integers(len(all_depths), size=len(scenes))]
     path = folder / "light.npz"
     if path.is_file():
-        return read_archive(path, "light of scenes", _AGAIN)[1]["light"], depths
+        return read_archive(path, "light of scenes", cameras.AGAIN)[1]["light"], depths
     found = []
     with meter(f"light, {bench.kind.name}", len(scenes), 0) as progress:
         for number, (scene, depth) in enumerate(zip(scenes, depths, strict=True)):
@@ -267,7 +146,7 @@ def _slopes(network: Any, seen: Any, far: Any, wanted: Any, covered: Any, option
     return jax.value_and_grad(loss, has_aux=True)(moving)
 
 
-def trained(bench: Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path) -> Network:
+def trained(bench: cameras.Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path) -> Network:
     """The network of a camera, trained or read."""
     path = folder / "network.npz"
     if path.is_file():
@@ -290,7 +169,7 @@ def trained(bench: Bench, scenes: Sequence[DirtyScene], plan: Plan, folder: Path
                 scene = scenes[k]
                 flip = int(rng.integers(2))  # every PSF here is even, but for errors of plates
                 images = (
-                    bench.corrected(taken(light[k], sensor, key), scene, depths[k]),
+                    bench.corrected(cameras.taken(light[k], sensor, key), scene, depths[k]),
                     srgb_from_linear(scene.background[:, edge:-edge, edge:-edge]),
                     scene.covered,
                 )
@@ -316,18 +195,6 @@ def _look(network: Network, seen: Any, far: Any) -> Any:
     return network(seen, far, far)[:, :3]
 
 
-def filtered(seen: np.ndarray, bench: Bench) -> np.ndarray:
-    """The classical way: holes filled from their surroundings, then one filter for all depths; display values."""
-    light, passed = seen[:3], seen[3]
-    weight = np.clip((passed - 0.1) / 0.3, 0.0, 1.0) + 1e-4
-    near = [scipy.ndimage.gaussian_filter(image, 6) for image in (*(light * weight), weight)]
-    light = weight * light + (1 - np.minimum(weight, 1)) * np.stack(near[:3]) / near[3]
-    mirrored = np.pad(light, ((0, 0), (0, light.shape[1]), (0, light.shape[2])), mode="symmetric")
-    side = mirrored.shape[-1]
-    sharp = np.fft.irfft2(np.fft.rfft2(mirrored) * bench.filter(side), (side, side))
-    return np.clip(srgb_from_linear(sharp[:, : light.shape[1], : light.shape[2]]), 0, 1).astype(np.float32)
-
-
 class Judged(NamedTuple):
     """Score of a picture."""
 
@@ -341,13 +208,13 @@ class Judged(NamedTuple):
 
 
 def judge(
-    bench: Bench,
+    bench: cameras.Bench,
     network: Network | None,
     scenes: Sequence[DirtyScene],
     plan: Plan,
     plate: str,
     lights: Sequence[float],
-    at: Bench,
+    at: cameras.Bench,
 ) -> tuple[list[Judged], dict[Any, np.ndarray]]:
     """Judge a camera, its network and one filter; `at` has the PSFs that take the pictures, `bench` those one knows of.
 
@@ -358,13 +225,13 @@ def judge(
     with meter(f"judging, {bench.kind.name} {plate}", len(scenes), 0) as progress:
         for number, scene in enumerate(scenes):
             wanted = srgb_from_linear(scene.background[:, edge:-edge, edge:-edge])[None]
-            for depth in JUDGED_M:
+            for depth in cameras.JUDGED_M:
                 light = light_of(scene, *at.at(depth), plan.size)
                 for brightness in lights:
-                    raw = taken(light, bench.sensor(brightness), noise_key(plan, 1, number))
+                    raw = cameras.taken(light, bench.sensor(brightness), noise_key(plan, 1, number))
                     seen = bench.corrected(raw, scene, depth)
                     found = {} if network is None else {"network": np.asarray(_look(network, seen[None], far))[0]}
-                    found["filter"] = filtered(seen, bench)
+                    found["filter"] = cameras.filtered(seen, bench)
                     for way, picture in found.items():
                         value = float(psnr(picture[None], wanted, scene.covered[None])[0])
                         rows.append(Judged(bench.kind.name, plate, way, brightness, depth, number, value))
@@ -388,7 +255,7 @@ def classic_plates(design: Design, folder: Path) -> dict[str, Any]:
             ("logarithmic_asphere", {"near": "2 m", "far": far}) for far in ("5 m", "10 m", "40 m")
         ],
     }
-    spec = load_spec(SPEC)
+    spec = load_spec(cameras.SPEC)
     rows = {}
     for name, starts in tries.items():
         found = []
@@ -397,7 +264,7 @@ def classic_plates(design: Design, folder: Path) -> dict[str, Any]:
             words = ["optimize.steps=0", f'optimize.start="{start}"']
             words += [] if start != "cubic" else ['optimize.parametrization="freeform"']
             words += [] if start != "logarithmic_asphere" else ['sensor.defocus="0 um"']
-            own = load_spec(SPEC, words)
+            own = load_spec(cameras.SPEC, words)
             own = own.model_copy(
                 update={"optimize": own.optimize.model_copy(update={"start_options": _options(own, options)})}
             )
@@ -416,7 +283,7 @@ def errors_of(design: Design, spec: Spec) -> dict[str, float]:
     """Mean and worst error of a design, as drawn, for all depths and for every depth's own filter."""
     camera = replace(design.camera, window=spec.sensor.window)
     height = design.nominal_height_m
-    far = psf(height, camera, depths_of(spec)).energy
+    far = psf(height, camera, cameras.depths_of(spec)).energy
     near = jnp.zeros((3, 0, camera.window, camera.window))
     view = PsfSet(near, jnp.asarray(far), jnp.zeros((3, 0)), jnp.zeros(0), camera)
     options: dict[str, Any] = dict(spec.objectives[0].options)
@@ -487,13 +354,13 @@ def draw(
 def run(out: Path, plan: Plan, images: Sequence[Path], judged: Sequence[Path]) -> dict[str, Any]:
     """Design, train and judge; return the summary."""
     pools = [Pictures(tuple(files), 512) for files in (images, judged)]
-    asked = {"spec_sha256": spec_digest(load_spec(SPEC)), "plan": asdict(plan)}
+    asked = {"spec_sha256": spec_digest(load_spec(cameras.SPEC)), "plan": asdict(plan)}
     with study_folder(out, {**asked, "pictures_sha256": [pool.digest() for pool in pools]}):
         return _run(out, plan, pools)
 
 
 def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
-    optimize(SPEC, out / "design")
+    optimize(cameras.SPEC, out / "design")
     design = open_design(out / "design")
     classic_plates(design, out)
     training = scenes_of(pools[0], plan, plan.scenes if plan.steps else 0, 0)
@@ -501,16 +368,16 @@ def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
     rows: list[Judged] = []
     shown: dict[str, dict[Any, np.ndarray]] = {}
     edge = 0
-    for kind in CAMERAS:
+    for kind in cameras.CAMERAS:
         folder = out / kind.name
         drawn = partial(_drawn, kind, design)
-        bench = Bench(kind, plan.size, folder, drawn)
+        bench = cameras.Bench(kind, plan.size, folder, drawn)
         network = trained(bench, training, plan, folder) if plan.steps else None
         edge = (bench.camera.window - 1) // 2
         found, shown[kind.name] = judge(bench, network, seen, plan, "drawn", (1.0, 0.1), bench)
         rows += found
         for number in range(DRAWS if kind.plate else 0):
-            made = Bench(kind, plan.size, folder / f"draw_{number}", partial(_fabricated, kind, design, number))
+            made = cameras.Bench(kind, plan.size, folder / f"draw_{number}", partial(_fabricated, kind, design, number))
             found, shown["plate, fabricated"] = judge(bench, network, seen, plan, f"fabricated {number}", (1.0,), made)
             rows += found
         write_atomic(out / "scores.csv", csv_table(rows, 6).encode())
@@ -520,15 +387,15 @@ def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
     return found
 
 
-def _drawn(kind: CameraKind, design: Design) -> CellOptic:
-    camera, _ = camera_of(kind)
+def _drawn(kind: cameras.CameraKind, design: Design) -> CellOptic:
+    camera, _ = cameras.camera_of(kind)
     return HeightOptic.of(camera, design.level_map.height_m if kind.plate else None)
 
 
-def _fabricated(kind: CameraKind, design: Design, number: int) -> CellOptic:
-    camera, spec = camera_of(kind)
+def _fabricated(kind: cameras.CameraKind, design: Design, number: int) -> CellOptic:
+    camera, spec = cameras.camera_of(kind)
     return replace(design, camera=camera).fabricated(
-        seed=0, draw=f"normal/{number}", depths=(min(depths_of(spec)), np.inf)
+        seed=0, draw=f"normal/{number}", depths=(min(cameras.depths_of(spec)), np.inf)
     )
 
 

@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 import dirty_scenes  # pyright: ignore[reportMissingImports]
 import wide_aperture  # pyright: ignore[reportMissingImports]
+import wide_cameras  # pyright: ignore[reportMissingImports]
 
 
 @pytest.mark.parametrize(("nearest_m", "waves"), [(1.0, 14.8), (2.0, 7.4), (5.0, 3.0)])
@@ -27,19 +28,19 @@ def test_a_plain_wide_aperture_is_out_of_focus_at_both_ends(nearest_m: float, wa
 
 
 def test_the_lens_is_focused_in_the_middle_of_its_range():
-    camera, spec = wide_aperture.camera_of(wide_aperture.CAMERAS[-1])
+    camera, spec = wide_cameras.camera_of(wide_cameras.CAMERAS[-1])
     rim = np.array([camera.aperture_m / 2])
     ends = [path_at_m(camera, rim, np.zeros(1), depth)[0] / 550e-9 for depth in (2.0, 4.0, np.inf)]
     # Chrome takes 5 um of the rim all round, 0.2 % of the waves.
     assert ends == pytest.approx([7.384, 0.0, -7.384], abs=0.02)
-    depths = np.array(wide_aperture.depths_of(spec))
+    depths = np.array(wide_cameras.depths_of(spec))
     assert np.diff(1 / depths) == pytest.approx(-np.full(6, 1 / 12), abs=1e-9)
 
 
 def test_every_camera_exposes_as_long():
     white = {}
-    for kind in wide_aperture.CAMERAS:
-        bench = wide_aperture.Bench(kind, 32, Path(), None)
+    for kind in wide_cameras.CAMERAS:
+        bench = wide_cameras.Bench(kind, 32, Path(), None)
         white[kind.name] = float(bench.sensor().white_e(3).mean())
     assert white["open"] == white["plate"] == 16000
     assert white["stop"] == pytest.approx(16000 * (4.44 / 11.4) ** 2, rel=5e-3)  # chrome on the rim
@@ -73,7 +74,7 @@ def test_bars_are_straight_and_at_one_distance():
 
 
 def test_the_spec_says_what_is_designed():
-    spec = load_spec(wide_aperture.SPEC)
+    spec = load_spec(wide_cameras.SPEC)
     assert (spec.optimize.parametrization, spec.process.levels) == ("radial", 16)
     assert spec.objectives[0].name == "filtered_error"
 
@@ -82,17 +83,17 @@ def test_the_spec_says_what_is_designed():
 def test_the_whole_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With smaller apertures, few steps and scenes: every table and picture, and the same again from files."""
     small = (
-        wide_aperture.SPEC.read_text().replace("steps = 1000", "steps = 4").replace("samples = 1500", "samples = 300")
+        wide_cameras.SPEC.read_text().replace("steps = 1000", "steps = 4").replace("samples = 1500", "samples = 300")
     )
     spec = tmp_path / "small.toml"
     spec.write_text(small.replace('"11.4 mm"', '"2.28 mm"'))
-    monkeypatch.setattr(wide_aperture, "SPEC", spec)
+    monkeypatch.setattr(wide_cameras, "SPEC", spec)
     monkeypatch.setattr(wide_aperture, "DRAWS", 1)
     kinds = (
-        wide_aperture.CameraKind("stop", "1.14 mm", 150, 2),
-        wide_aperture.CameraKind("plate", "2.28 mm", 300, 3, True),
+        wide_cameras.CameraKind("stop", "1.14 mm", 150, 2),
+        wide_cameras.CameraKind("plate", "2.28 mm", 300, 3, True),
     )
-    monkeypatch.setattr(wide_aperture, "CAMERAS", kinds)
+    monkeypatch.setattr(wide_cameras, "CAMERAS", kinds)
     plan = wide_aperture.Plan(size=48, scenes=2, judged=2, steps=2, width=4)
     files = sample_files()
     found = wide_aperture.run(tmp_path / "out", plan, files[:2], files[2:4])
