@@ -312,6 +312,7 @@ TABLES = sorted(path.stem for path in RESULTS.glob("table?-*.csv"))
 PAGES = {"dirt": "validation-dirt.md", "raindrop": "validation-raindrop.md", "fence": "validation-fence.md"}
 
 
+OPTICS_ALONE = {"optics_only", "optics_only_fabricated"}
 CAPTURES = ("capture_fabricated", "robust_capture", "robust_capture_fabricated")
 
 
@@ -346,8 +347,11 @@ def test_rows_that_were_joined_are_those_of_the_later_run(path: Path):
         "seed1": set(),
         "robust": {"robust", "robust_fabricated", "robust_untold"},
         "biharmonic": {"biharmonic_of_capture"},
-        # Dirt is of the very trainings of its table, looked at again; fences are of those of the robust plate.
-        "captures": set(CAPTURES) if "fence" in path.stem else set(),
+        # Of dirt under the reciprocal model they are of the very trainings of its table, looked at again.
+        # Fences have optics alone of their first run.
+        "captures": set()
+        if "reciprocal" in path.stem
+        else set(CAPTURES) | (set() if "fence" in path.stem else OPTICS_ALONE),
     }[path.parent.name]
     for one in joined:
         other = table[one["row"], one["region"], one["score"]]
