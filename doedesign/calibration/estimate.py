@@ -189,7 +189,8 @@ def _calibrated(
     probe = (Colour("probe", (spec.probe_m,), (1.0,)),)
     camera = replace(design.camera, colours=probe, pixel_m=spec.pixel_m, window=measurement.window, fill=fill)
     depths, geometry = tuple(image.depth_m for image in images), spec.camera.prior
-    model = ForwardModel(design.level_map.level, camera, unknowns, depths, geometry)
+    radii = tuple(image.beam_radius_m for image in images)
+    model = ForwardModel(design.level_map.level, camera, unknowns, depths, geometry, radii)
     nominal = model.plate(unknowns.start)
     expected = [nominal.image(i, np.array([0.0, 0.0, 0.0, *geometry.mean])) for i in range(len(images))]
     targets = (target_of(image, measurement.window, like) for image, like in zip(images, expected, strict=True))

@@ -8,6 +8,7 @@ A plate and its images can be differentiated backwards, from a gradient with res
 to errors and motions; the light of all images goes back through one plate.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -23,6 +24,7 @@ from doedesign.calibration.geometry import UPRIGHT, GeometryPrior, displacement_
 from doedesign.calibration.target import Image
 from doedesign.calibration.unknowns import Unknowns
 from fab.grid import Grid
+from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.propagation.farfield import FarField, bent, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
@@ -56,6 +58,7 @@ class _Optic(eqx.Module):
     source_waves: Float[Array, "y x"]
     axis: Float[Array, " x"]  # cells from the middle
     rates: Float[Array, "3"]  # waves per cell and unit of motion (twice) and per cell² (defocus)
+    amplitude: Float[Array, "y x"] | None  # of the light on the cells; None where it is even
     camera: Camera | None = eqx.field(static=True)  # where pixels may lie elsewhere, or None
     factor: float = eqx.field(static=True)  # Fresnel transmission
 
@@ -65,7 +68,8 @@ def _energy(optic: _Optic, view: Int[Array, ""], plate: Transmission, motion: Fl
     plan = optic.plan
     if optic.camera:
         plan = bent(plan, optic.camera, displacement_m(optic.camera, motion[3:], motion[:2]))
-    rows = DoeRows(None, None, plate[view], (optic.source_waves, optic.axis))
+    light = plate[view] if optic.amplitude is None else plate[view] * optic.amplitude
+    rows = DoeRows(None, None, light, (optic.source_waves, optic.axis))
     return optic.factor * plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion[:3]))
 
 
@@ -73,7 +77,8 @@ def _energy(optic: _Optic, view: Int[Array, ""], plate: Transmission, motion: Fl
 class ForwardModel:
     """A plate, drawn in levels, in front of a camera of one wavelength; images of point sources at some depths.
 
-    These sources light it evenly, whatever beam the camera has for its design.
+    Whatever beam the camera has for its design, these sources light the plate evenly, or as Gaussian beams with radii
+    at 1/e² of their irradiance, one for every depth.
     """
 
     level: UInt8[np.ndarray, "y x"]
@@ -81,6 +86,7 @@ class ForwardModel:
     unknowns: Unknowns
     depths_m: tuple[float, ...]
     geometry: GeometryPrior = UPRIGHT
+    beam_radii_m: tuple[float, ...] = ()
     _optics: dict[Any, _Optic] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -121,8 +127,8 @@ class ForwardModel:
 
     def optic(self, index: int, grid: Grid) -> _Optic:
         """Plan and source of an image for a plate of some cells; made once."""
-        depth_m = self.depths_m[index]
-        key = (depth_m, grid)
+        depth_m, radius_m = self.depths_m[index], self.beam_radii_m[index] if self.beam_radii_m else math.inf
+        key = (depth_m, radius_m, grid)
         if key not in self._optics:
             camera, wavelength = replace(self.camera, grid=grid), self.wavelength_m
             scale = grid.pitch_m / wavelength
@@ -132,10 +138,18 @@ class ForwardModel:
                 jnp.asarray(source_waves(camera, wavelength, depth_m)),
                 jnp.asarray(grid.axis_m("x") / grid.pitch_m, jnp.float32),
                 jnp.asarray([shift, shift, scale * grid.pitch_m / 2], jnp.float32),
+                None if math.isinf(radius_m) else _beam(camera, radius_m),
                 None if self.geometry.upright else camera,
                 camera.transmission(wavelength),
             )
         return self._optics[key]
+
+
+def _beam(camera: Camera, radius_m: float) -> Float[Array, "y x"]:
+    """Amplitude of a Gaussian beam on the cells, whose power on the clear aperture is that of even light."""
+    y, x = camera.grid.axis_m("y")[:, None], camera.grid.axis_m("x")
+    irradiance, coverage = np.exp(-2 * (y**2 + x**2) / radius_m**2), open_cells(camera.grid, camera.opening)
+    return jnp.asarray(np.sqrt(irradiance * coverage.sum() / (irradiance * coverage).sum()), jnp.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ from doedesign.spec.values import FarDepth, Pitch, Positive, Wavelength, bounded
 from doedesign.spec.values.table import SpecTable
 from fab.errors import InputError
 from fab.files import sha256_file
-from fab.units import MM
+from fab.units import MM, UM, format_length
 from sim.camera import Camera
 from sim.frames import CameraFrame, Channel, read_frame
 from sim.measured import MeasuredPsf, Noise, centre_of_light, cut_window, merge_exposures, without_background
@@ -143,6 +143,9 @@ class MeasurementSpec(SpecTable, frozen=True):
         gain: electrons per count.
         read_noise: electrons, standard deviation of a reading.
         image: the images, `[[image]]` in TOML.
+        mode_field_m: diameter of the mode field of a fibre whose tip is the source, at 1/e² of its irradiance: a near
+            tip lights the rim of the plate less than its middle. Without it, light on the plate is even.
+        collimator_m: focal length of the lens that collimates that light for images at infinity, which is even without.
         window: pixels per side that are compared; by default what the design's window covers, or the images hold.
         fill_factor: side of a pixel's light-sensitive square over its pitch; the design's by default.
         saturation: counts from which a pixel is full; what the files say by default.
@@ -160,6 +163,8 @@ class MeasurementSpec(SpecTable, frozen=True):
     gain: Positive = Field(examples=["2.1"])
     read_noise: Annotated[float, Field(strict=True, ge=0)] = Field(examples=["2.5"])
     image: tuple[ImageSpec, ...] = Field(min_length=1)
+    mode_field_m: Annotated[float, length(0.1 * UM, 1 * MM)] | None = Field(None, examples=['"3.5 um"'])
+    collimator_m: Annotated[float, length(1 * MM, 10.0)] | None = Field(None, examples=['"100 mm"'])
     window: Annotated[int, Field(strict=True, ge=16, le=8192)] | None = Field(None, examples=["256"])
     fill_factor: Share | None = Field(None, examples=["0.9"])
     saturation: Positive | None = Field(None, examples=["4095"])
@@ -169,6 +174,13 @@ class MeasurementSpec(SpecTable, frozen=True):
     mirrored: bool = False
     defocus_sigma_m: Annotated[float, length(0.0, 10 * MM)] = 0.0
     camera: CameraSpec = CameraSpec()
+
+    def beam_radius_m(self, depth_m: float) -> float:
+        """Radius of the light on the plate at 1/e² of the irradiance in its middle, for a source at a depth."""
+        path_m = depth_m if math.isfinite(depth_m) else self.collimator_m
+        if self.mode_field_m is None or path_m is None:
+            return math.inf
+        return path_m * 2 * self.probe_m / (math.pi * self.mode_field_m)
 
 
 class Measurement(NamedTuple):
@@ -201,6 +213,9 @@ def load_measurement(path: Path) -> MeasurementSpec:
 
 
 def _problems(spec: MeasurementSpec) -> Iterator[InputError]:
+    if spec.collimator_m is not None and spec.mode_field_m is None:
+        cure = 'Add mode_field = "3.5 um", or leave it out.'
+        yield InputError("collimator", "goes with a mode_field", format_length(spec.collimator_m), cure)
     names = [image.called for image in spec.image]
     for i, image in enumerate(spec.image):
         key, count = f"image[{i}]", len(image.files)
@@ -295,6 +310,7 @@ def _measured_image(
         centre=((size - 1) / 2 + rest[0], (size - 1) / 2 + rest[1]),
         brightness=(image.incident, image.incident_sigma) if image.incident else None,
         defocus_sigma=math.hypot(bend, spec.defocus_sigma_m / camera.sensor_distance_m**2),
+        beam_radius_m=spec.beam_radius_m(image.depth_m),
     )
 
 

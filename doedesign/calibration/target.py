@@ -5,6 +5,7 @@ linear least squares, so the search never sees them (variable projection): with 
 best gain and background, the gradient of the weighted squares with respect to the model is -2 gain W r.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ class MeasuredImage(NamedTuple):
         brightness: rate that all light on the clear aperture would give, and its relative standard deviation; None
             where only the shape is known.
         defocus_sigma: standard deviation of the source's curvature, 1/m; 0 if its depth is exact.
+        beam_radius_m: radius of a Gaussian beam on the plate, at 1/e² of its irradiance; infinite for even light.
     """
 
     name: str
@@ -34,6 +36,7 @@ class MeasuredImage(NamedTuple):
     centre: tuple[float, float]
     brightness: tuple[float, float] | None = None
     defocus_sigma: float = 0.0
+    beam_radius_m: float = math.inf
 
 
 class Target(NamedTuple):

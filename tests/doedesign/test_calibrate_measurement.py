@@ -43,6 +43,8 @@ def written(folder: Path, text: str) -> Path:
         (HEAD + IMAGE + 'dark = ["d"]\nblack_level = 64.0', "must be left out beside `dark`"),
         (HEAD + IMAGE + IMAGE, 'every image must have its own name, but got "a" twice'),
         (HEAD + IMAGE + "incident = 1e7", "counts per second mean nothing without an exposure"),
+        ('collimator = "100 mm"\n' + HEAD + IMAGE, "goes with a mode_field, but got 100 mm"),
+        ('mode_field = "3.5"\n' + HEAD + IMAGE, "mode_field"),
         (HEAD + IMAGE.replace("6 mm", "6"), "must be a number with a unit"),
         (HEAD + 'channel = "violet"\n' + IMAGE, "must be one of red, green, blue"),
         ("probe = 520 nm", "a measurement must be valid TOML"),

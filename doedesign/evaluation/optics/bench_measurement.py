@@ -139,6 +139,9 @@ class BenchMeasurement:
         yield f"gain = {bench.gain!r}"
         yield f"read_noise = {bench.read_noise!r}"
         yield f"saturation = {bench.full}"
+        if bench.mode_field_m:
+            yield f'mode_field = "{bench.mode_field_m / UM:.9g} um"'
+            yield f'collimator = "{bench.collimator_m * 1e3:.9g} mm"'
         if self.window is not None:
             yield f"window = {self.window} # that the relay passes whole"
         yield "quarter_turns = 2 # the relay's half turn"

@@ -65,7 +65,8 @@ def figure(
         _log.info("photographing a plate on the bench")
         made_by = design.process(process)
         share = min(1.0, design.camera.focal_length_m / _LENS_M)
-        bench = PsfBench() if share == 1 else PsfBench().scaled(share)
+        paper = PsfBench(within_relay=True)  # what it stops would be taken for errors of the plate
+        bench = paper if share == 1 else paper.scaled(share)
         measured = bench_measurement(design, made_by, bench_errors(design, made_by, seed), bench, seed=seed)
         tables, picture = {"images.csv": csv_table(measured.rows, 6)}, measured.plot()
         tables["throughput.json"] = canonical_json(measured.throughput._asdict()).decode()

@@ -1,10 +1,10 @@
 """The paper's PSF bench (§5, figs. 7 and 8): the light that reaches its camera.
 
 A single-mode fibre at 520 nm lights a plate, from its tip near by or collimated by a lens. Two equal lenses, a relay,
-image the plate onto the aperture of the camera's lens. What a fit to the frames is not told:
+image the plate onto the aperture of the camera's lens. The fibre's light is a Gaussian of its mode field in angle, so a
+near tip lights the rim of the aperture less than its middle (A. W. Snyder and J. D. Love, *Optical Waveguide Theory*,
+§20: divergence wavelength / (pi w0)); the description of a measurement tells the mode field. What it does not tell:
 
-* The fibre's light is a Gaussian of its mode field in angle, so a near tip lights the rim of the aperture less than its
-  middle (A. W. Snyder and J. D. Love, *Optical Waveguide Theory*, §20: divergence wavelength / (pi w0)).
 * The relay's lenses have rims of radius R at a distance f from the plate. A ray that leaves the plate at x in the
   direction of sine s meets the first lens at x + f s and, 2 f behind it, the second at f s - x. So the pixel that
   images s sees only that part of the aperture where |x + f s| < R and |x - f s| < R: all of it up to s = (R - a) / f
