@@ -9,7 +9,7 @@ import pytest
 
 from doedesign.calibration.estimate import calibrate
 from doedesign.calibration.forward_model import ForwardModel
-from doedesign.calibration.measurement import ImageSpec, MeasurementSpec, read_measurement
+from doedesign.calibration.measurement import load_measurement, read_measurement
 from doedesign.calibration.unknowns import unknowns_of
 from doedesign.evaluation.optics.bench_measurement import bench_measurement
 from doedesign.evaluation.optics.psf_bench import PsfBench, bench_camera, bench_light, bench_throughput
@@ -98,14 +98,24 @@ def test_fibre_lights_the_rim_less_than_the_middle():
     assert even.sum() <= faces
 
 
-def test_a_fit_that_is_told_of_the_fibre_sees_its_light():
+def test_a_fit_that_is_told_of_the_fibre_sees_its_light(tmp_path: Path):
     """Bench and calibration each have the Gaussian in their own words: a radius from the mode field, a power of 1."""
     design = plate_drawn(64, 8, window=48)
     bench = PsfBench.exact(mode_field_m=3.5e-6, margin=0, collimator_m=12.5e-3)
     camera = bench_camera(design, bench)
-    told = {"gain": 2.0, "read_noise": 4.0, "pixel_m": camera.pixel_m, "probe_m": bench.probe_m}
-    image = (ImageSpec(depth_m=NEAR_M, files=("near.tiff",)),)
-    spec = MeasurementSpec(**told, image=image, mode_field_m=3.5e-6, collimator_m=12.5e-3)
+    told = f"""
+    probe = "520 nm"
+    pixel = "{camera.pixel_m * 1e6:.9g} um"
+    gain = 2.0
+    read_noise = 4.0
+    mode_field = "3.5 um"
+    collimator = "12.5 mm"
+    [[image]]
+    depth = "2 mm"
+    files = ["near.tiff"]
+    """
+    (tmp_path / "measurement.toml").write_text(told)
+    spec = load_measurement(tmp_path / "measurement.toml")
     radii = tuple(spec.beam_radius_m(depth) for depth in DEPTHS)
     depth_alone = unknowns_of(usual_process(design), ["common_depth_scale"])
     model = ForwardModel(design.level_map.level, camera, depth_alone, DEPTHS, beam_radii_m=radii)
