@@ -2,6 +2,7 @@
 
     python -m bench.plate            minutes
     python -m bench.plate --quick    N = 600; the targets are for the full size
+    python -m bench.plate --light edges    one light alone
 
 A draw of the stock process `contact_aligner`, every error at once: 2400 x 2400 cells, 16 levels, three colours, a near
 and a far depth, as a thin element and with the light of walls. Both take their turn in every round; the table gives the

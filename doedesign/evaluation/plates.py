@@ -81,7 +81,7 @@ def plates_of(
     with meter("computing PSFs", 1 + len(wanted)) as progress:
         for count, (name, seed) in enumerate(wanted, 1):
             progress.advance(count)
-            design = plan.plate(TRAININGS[name], seed)
+            design = plan.design_after(TRAININGS[name], seed)
             drawn = psf(optic_as_drawn(camera, design.level_map.height_m, depths_m=depths), camera, depths)
             banks = PlateBanks(drawn)
             if name in made:

@@ -94,8 +94,8 @@ class TrainingPlan:
         assert source is not None  # rows of a robust design come with one
         return open_design(source, False, overrides=self.changes(training, seed), free=TRAINING_TABLES)
 
-    def plate(self, training: Training, seed: int) -> Design:
-        """The design whose plate a training leaves; it must be finished, unless it keeps its plate."""
+    def design_after(self, training: Training, seed: int) -> Design:
+        """The design that a training leaves; it must be finished, unless it keeps its plate."""
         if training.keeps_plate:
             return self.design(training, seed)
         return open_design(self.folder(training, seed), False)

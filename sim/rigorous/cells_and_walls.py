@@ -146,7 +146,7 @@ def _rows_around(
 ) -> Array:
     """Some rows, with what lies around them.
 
-    A plate that were padded as a whole would be one more to have memory for.
+    Padding the whole plate would take memory for one more.
 
     Args:
         values: of all cells.
@@ -161,7 +161,7 @@ def _rows_around(
 
     def within(values: Array) -> Array:
         rows = jax.lax.dynamic_slice_in_dim(values, first, size)
-        return jnp.pad(rows, ((0, tall - size), (0, 0)))  # of plates that are no taller, not taken
+        return jnp.pad(rows, ((0, tall - size), (0, 0)))  # a lower plate never comes here, but needs this shape
 
     def at_the_rim(values: Array) -> Array:
         rows = jax.lax.dynamic_slice_in_dim(values, first, size)

@@ -1,4 +1,4 @@
-"""The PSF bench: closed forms of its parts, and a calibration that is not told of them."""
+"""The PSF bench: closed forms of its parts, and a calibration that is told of the fibre alone."""
 
 import math
 from dataclasses import replace

@@ -65,7 +65,7 @@ def figure(
         _log.info("photographing a plate on the bench")
         made_by = design.process(process)
         share = min(1.0, design.camera.focal_length_m / _LENS_M)
-        paper = PsfBench(within_relay=True)  # what it stops would be taken for errors of the plate
+        paper = PsfBench(within_relay=True)  # what the relay stops would be taken for errors
         bench = paper if share == 1 else paper.scaled(share)
         measured = bench_measurement(design, made_by, bench_errors(design, made_by, seed), bench, seed=seed)
         tables, picture = {"images.csv": csv_table(measured.rows, 6)}, measured.plot()
