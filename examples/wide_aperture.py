@@ -295,33 +295,46 @@ def errors_of(design: Design, spec: Spec) -> dict[str, float]:
 
 
 def summary_of(rows: Sequence[Judged]) -> dict[str, Any]:
-    """Means by camera, plate, way, light and depth; worst depths; differences of the plate over every rival."""
-    table: dict[str, Any] = {}
+    """Means by camera, plate, way, light and depth; worst depths; differences of the plate over every rival.
+
+    What is "as fabricated" is the mean over the plates that are, picture by picture.
+    """
     by: dict[tuple[str, str, str, float], dict[float, dict[int, float]]] = {}
+    several: dict[Any, list[float]] = {}
     for row in rows:
         by.setdefault(row[:4], {}).setdefault(row.depth_m, {})[row.scene] = row.psnr
-    worst = {}
+        if row.plate.startswith("fabricated"):
+            several.setdefault((row.camera, row.way, row.light, row.depth_m, row.scene), []).append(row.psnr)
+    for (camera, way, light, depth, scene), psnrs in several.items():
+        by.setdefault((camera, "as fabricated", way, light), {}).setdefault(depth, {})[scene] = float(np.mean(psnrs))
+    table: dict[str, Any] = {}
+    worst: dict[Any, list[float]] = {}  # scores of every picture at the depth that is worst
+    average: dict[Any, list[float]] = {}  # over the depths
     for key, depths in by.items():
-        means = {depth: float(np.nanmean([*scores.values()])) for depth, scores in depths.items()}
+        scores = {depth: [of[k] for k in sorted(of)] for depth, of in depths.items()}
+        means = {depth: float(np.nanmean(of)) for depth, of in scores.items()}
         last = min(means, key=means.__getitem__)
-        worst[key] = last
+        worst[key], average[key] = scores[last], np.mean([*scores.values()], axis=0).tolist()
         table[" / ".join(map(str, key))] = {f"{depth:g}": value for depth, value in means.items()} | {
             "mean": float(np.mean([*means.values()])),
             "worst": means[last],
-            "interval": list(mean_and_interval([*depths[last].values()])),
+            "interval": list(mean_and_interval(scores[last])),
         }
-    differences = {}
-    for key in by:
-        if key[0] != "plate":
-            continue
-        for rival in by:
-            if rival[0] == "plate" or rival[2:] != key[2:]:
-                continue
-            # Each at the depth that is worst for it, on the same pictures.
-            own, other = by[key][worst[key]], by[rival][worst[rival]]
-            pair = paired_difference([own[k] for k in sorted(own)], [other[k] for k in sorted(own)])
-            differences[f"{' / '.join(map(str, key))} over {rival[0]}"] = list(pair)
-    return {"scores": table, "worst depth, plate over rival": differences}
+    pairs = [
+        (key, rival) for key in by for rival in by if key[0] == "plate" and rival[0] != "plate" and rival[2:] == key[2:]
+    ]
+
+    def over(scores: Mapping[Any, list[float]]) -> dict[str, list[float]]:
+        return {
+            f"{' / '.join(map(str, key))} over {rival[0]}": list(paired_difference(scores[key], scores[rival]))
+            for key, rival in pairs
+        }
+
+    return {
+        "scores": table,
+        "worst depth, plate over rival": over(worst),
+        "mean of the depths, plate over rival": over(average),
+    }
 
 
 def draw(

@@ -262,7 +262,7 @@ def _once(function: Callable[..., Any], *arrays: Any) -> Any:
     """The value of a function, computed once for all who use it.
 
     A compiler that fuses loops computes cheap values anew for every neighbour that reads them, ten times here; it
-    does not look into a branch. Heights that are not numbers give none of this light, and their own is none either.
+    does not look into a branch. Heights that are not numbers give light that is none either.
     Arrays of one shape leave the branch two by two as complex ones, for there is one loop for every array, and one
     for real and imaginary part takes half of the time of two.
     """
@@ -278,7 +278,7 @@ def _once(function: Callable[..., Any], *arrays: Any) -> Any:
         return [jax.lax.complex(*of) if len(of) == 2 else of[0] for of in (found[pair] for pair in pairs)]
 
     def none(*arrays: Any) -> list[Array]:
-        return [jnp.zeros(one.shape, one.dtype) for one in jax.eval_shape(joined, *arrays)]
+        return [jnp.full(one.shape, jnp.nan, one.dtype) for one in jax.eval_shape(joined, *arrays)]
 
     some = jax.lax.cond(jnp.isfinite(jax.tree.leaves(arrays)[0][0, 0]), joined, none, *arrays)
     parts = [part for one in some for part in ((one.real, one.imag) if jnp.iscomplexobj(one) else (one,))]

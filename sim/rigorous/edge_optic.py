@@ -83,20 +83,22 @@ class EdgeOptic(ViewedOptic):
         """The same DOE before another lens or sensor; a ValueError for another aperture, substrate or kind of light."""
         own = super().with_camera(replace(camera, grid=self.drawn.grid)).camera
         drawn = replace(own, grid=self.drawn.grid)
-        return self if drawn == self.drawn else replace(self, drawn=drawn)._prepared(self.height_m, self.depths_m)
+        return self if drawn == self.drawn else self._prepared(self.height_m, drawn, self.depths_m)
 
     def prepared_for(self, depths_m: Sequence[float]) -> "EdgeOptic":
         """The same for sources at other depths, metres."""
         least, most = self.depths_m
         enough = least <= min(depths_m) and max(depths_m) <= most
-        return self if enough else self._prepared(self.height_m, (*self.depths_m, *depths_m))
+        return self if enough else self._prepared(self.height_m, self.drawn, (*self.depths_m, *depths_m))
 
     def with_heights(self, height_m: Float[Array, "y x"]) -> "EdgeOptic":
         """The same with other heights; they may be traced."""
-        return self._prepared(height_m, self.depths_m)
+        return self._prepared(height_m, self.drawn, self.depths_m)
 
-    def _prepared(self, height_m: Any, depths_m: Sequence[float]) -> "EdgeOptic":
-        return replace(with_edges(height_m, self.drawn, depths_m=depths_m), source_kind=self.source_kind)
+    def _prepared(self, height_m: Any, camera: Camera, depths_m: Sequence[float]) -> "EdgeOptic":
+        own = None if camera.lines != self.drawn.lines else self.wavelengths_m
+        found = with_edges(height_m, camera, depths_m=depths_m, wavelengths_m=own)
+        return replace(found, source_kind=self.source_kind)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -112,7 +114,13 @@ class EdgeOptic(ViewedOptic):
         return map_m
 
 
-def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np.inf,)) -> EdgeOptic:
+def with_edges(
+    height_m: Any,
+    camera: Camera,
+    *,
+    depths_m: Sequence[float] = (np.inf,),
+    wavelengths_m: Sequence[float] | None = None,
+) -> EdgeOptic:
     """A DOE of upright walls, with their light.
 
     Args:
@@ -120,17 +128,21 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
             by more than two waves from one cell to the next.
         camera: DOE grid, aperture, substrate, lens and sensor, and the polarisation of the light.
         depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between.
+        wavelengths_m: vacuum wavelengths; those of the camera's lines by default.
 
     Returns:
-        the DOE, lit from the side of its relief.
+        the DOE, lit from the side of its relief; a function of the heights for `jax.grad`, not for `jax.jvp`.
 
     Raises:
-        ValueError: heights of another shape than the grid's.
+        ValueError: heights of another shape than the grid's, or, unless traced, one that is not finite.
     """
     drawn, height = camera, jnp.asarray(height_m, jnp.float32)
     if height.shape != camera.grid.shape:
         raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
-    wavelengths = tuple(dict.fromkeys(line.wavelength_m for line in camera.lines))
+    range_m = None if is_traced(height) else float(jnp.ptp(height))
+    if range_m is not None and not np.isfinite(range_m):
+        raise ValueError("`height_m` must be finite everywhere, but some of it is not")
+    wavelengths = tuple(dict.fromkeys(wavelengths_m or (line.wavelength_m for line in camera.lines)))
     depths = min(depths_m), max(depths_m)
     drawn_m, parts = height, 1
     while not all(_is_seen(camera, wavelength, (depth,), parts) for wavelength in wavelengths for depth in depths):
@@ -144,7 +156,7 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
     for view in views:
         wavelength = view.wavelength_m
         index = refractive_index(camera.material, wavelength)
-        highest = highest_wall(two_waves(wavelength, index) if is_traced(height) else float(jnp.ptp(height)))
+        highest = highest_wall(two_waves(wavelength, index) if range_m is None else range_m)
         waves = oblique_waves(camera, wavelength, (view.nearest_m, view.farthest_m))
         taps = line_weights(*waves, camera.opening)[0], dipole_weights(*waves, camera.opening)
         walls = []

@@ -2,8 +2,8 @@
 
 A mask that lies off by a fraction of a cell, or prints its openings too wide, moves all its edges, so every cell is cut
 along a few lines, the same ones in all cells of a small tile (`Cuts`). Between the lines the depth is constant. The
-depth of every piece of every cell is one matrix product of the masks' states with what each etch takes away
-(`piece_depths`), and its light needs one exponential.
+depth of every piece of every cell is one matrix product of the masks' states with what each etch takes away, and its
+light needs one exponential.
 
 A lens does not see the pieces. It sees how much light a cell passes and, to its first three moments, from where within
 the cell: exp(-2 pi i u x) over a cell is a short series of Legendre polynomials, sum (2q+1) (-i)^q j_q(pi u) P_q(2x),

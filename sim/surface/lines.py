@@ -229,7 +229,10 @@ def _as_one_wall(before: _Side, behind: _Side, axis: int, relief: EtchParameters
     """Line and dipole, `[w, cell]` each, of a wall between two sides."""
     assert relief.walls is not None
     numbers, rise = relief.walls, behind.height_m - before.height_m
-    height, rises, foot_m = jnp.abs(rise), rise > 0, jnp.minimum(before.height_m, behind.height_m)
+    rises, foot_m = rise > 0, jnp.minimum(before.height_m, behind.height_m)
+    # Beyond the highest wall the series know nothing: it counts as that one, as in plates as drawn.
+    rise = jnp.clip(rise, -numbers.highest_m, numbers.highest_m)
+    height = jnp.abs(rise)
     lower, higher = (
         Pair(*(jnp.where(rises, one[part], other[part]) for part in (0, 1)))
         for one, other in ((before.light, behind.light), (behind.light, before.light))

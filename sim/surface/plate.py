@@ -45,8 +45,8 @@ class FabricatedDoe(ViewedOptic):
             within `sim.surface.cell`'s accuracy.
         views: wavelength and depths of sources for which each transmission holds. Several for a wavelength whose light
             on a near and on a far source's way takes too wide a band.
-        means: `[wavelength, y, x]` mean transmission of every cell without the chrome, for overlaps with other DOEs; 0
-            far under it.
+        means: `[wavelength, y, x]` mean transmission of every cell without the chrome, for overlaps with other DOEs;
+            where the plate is not as drawn 0 far under it.
         wavelengths_m: vacuum wavelengths, metres.
         height_m: `[y, x]` height, metres, of every cell of a DOE exactly as drawn, whose PSFs are those of its height
             map, bit for bit; otherwise None.
@@ -76,6 +76,20 @@ class FabricatedDoe(ViewedOptic):
         rows, columns = super().rows(line, source)
         return (rows if self.height_m is not None else rows._replace(coverage=None)), columns
 
+    def with_camera(self, camera: Camera) -> "FabricatedDoe":
+        """The same DOE before another lens or sensor, which sees nothing more oblique than its own if it is to be exact.
+
+        Raises:
+            ValueError: another aperture, substrate or kind of light, or light of walls in another polarisation.
+        """
+        own = self.camera
+        if own.light == camera.light == "edges" and own.polarisation != camera.polarisation:
+            wanted, got = own.polarisation, camera.polarisation
+            raise ValueError(f"`camera` must have the polarisation that the walls are lit in, {wanted}, but got {got}")
+        found = super().with_camera(camera)
+        assert isinstance(found, FabricatedDoe)
+        return found
+
 
 def as_fabricated(
     level_map: UInt8[np.ndarray, "y x"],
@@ -93,7 +107,7 @@ def as_fabricated(
         level_map: `[y, x]` level numbers, the top level where the glass stays blank (`fab.level_map.LevelMap.level`).
         camera: DOE grid, clear aperture and material; lens and sensor say how oblique the light is that matters.
         process: depths of the etches and where on the wafer the DOE lies.
-        variation: the errors; `Variation()` gives the nominal plate bit for bit.
+        variation: the errors; `Variation()` gives the nominal plate, bit for bit but with `whole_cells` and edges.
         wavelengths_m: vacuum wavelengths; all lines of the camera by default.
         depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between. They say
             how obliquely cells are lit, which matters where edges moved within them. From other depths the plate looks
@@ -105,7 +119,7 @@ def as_fabricated(
         the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.
 
     Raises:
-        InputError: an edge moves by half a cell or more through line-width bias, corners are rounded by more than
+        InputError: an error is not finite, an edge moves by half a cell or more through line-width bias, corners are rounded by more than
             half a cell, a mask is shifted by more than 8 cells, or an error has the wrong number of masks.
         ValueError: a level map of another shape than the grid.
     """
@@ -116,9 +130,10 @@ def as_fabricated(
     traced = is_traced(variation)
     waves = np.array([camera.waves_per_metre(w) for w in lines])
     rates = jnp.asarray(waves, jnp.float32)
-    if not traced and variation.nominal and camera.light == "edges":
-        return _walled(with_edges(height_of(level_map, levels), camera, depths_m=depths_m), lines)
-    if not traced and variation.nominal:
+    if not traced and variation.nominal and camera.light == "edges" and not whole_cells:
+        height_m = height_of(level_map, levels)
+        return _walled(with_edges(height_m, camera, depths_m=depths_m, wavelengths_m=lines))
+    if not traced and variation.nominal and camera.light == "scalar":
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([height_transmission(height, rate) for rate in rates])
         coverage = jnp.asarray(open_cells(camera.grid, camera.opening))
@@ -166,21 +181,25 @@ def _widths(plane: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
 
 
 def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
-    """A height that no wall exceeds by much; errors of usual size have it in common, and what is made for it."""
+    """A height that no wall exceeds; errors of usual size have it in common, and what is made for it.
+
+    Errors that are traced are not known here: the light of walls beyond is then that of the highest.
+    """
     none = (0,) * process.masks
     drawn = [depth * (1 + n) for depth, n in zip(process.depths_m(), variation.repeats or none, strict=True)]
     usual = sum(drawn) or sum(process.depths_m())  # where every etch was missed there are no walls
     scales = none if traced else variation.depth_scale or none
     common = 0.0 if traced else variation.common_depth_scale
-    made = sum(abs(depth * (1 + common) * (1 + scale)) for depth, scale in zip(drawn, scales, strict=True))
+    uneven = (variation.radial_nonuniformity, variation.linear_nonuniformity_y, variation.linear_nonuniformity_x)
+    most = 1.0 if traced else 1.0 + sum(map(abs, uneven))  # at the wafer's rim
+    made = most * sum(abs(depth * (1 + common) * (1 + scale)) for depth, scale in zip(drawn, scales, strict=True))
     return HEADROOM * usual * max(1, int(np.ceil(made / usual / HEADROOM)))
 
 
-def _walled(optic: EdgeOptic, wavelengths_m: tuple[float, ...]) -> FabricatedDoe:
+def _walled(optic: EdgeOptic) -> FabricatedDoe:
     """A DOE as drawn, with its light of walls."""
-    own = [k for k, view in enumerate(optic.views) if view.wavelength_m in wavelengths_m]
-    light, views = optic.coverage * optic.transmission[np.array(own)], tuple(optic.views[k] for k in own)
-    return FabricatedDoe(optic.camera, optic.coverage, light, views, optic.from_afar(wavelengths_m), wavelengths_m)
+    light = optic.coverage * optic.transmission
+    return FabricatedDoe(optic.camera, optic.coverage, light, optic.views, optic.means, optic.wavelengths_m)
 
 
 def drawn_alike(

@@ -126,7 +126,10 @@ def test_compensated_masks_bring_the_expected_plate_back(design):
 
 
 @pytest.mark.slow
-def test_the_largest_error_matters_most(design):
+@pytest.mark.parametrize("light", ["scalar", "edges"])
+def test_the_largest_error_matters_most(design, light):
+    """At a wavelength that is none of the camera's lines, as a design wavelength may be."""
+    design = replace(design, camera=replace(design.camera, light=light))
     spreads = {
         "overlay_x_m[3]": Normal(0.0, 0.4 * UM),
         "overlay_y_m[3]": Normal(0.0, 0.4 * UM),
@@ -134,9 +137,11 @@ def test_the_largest_error_matters_most(design):
         "depth_scale[3]": Normal(0.0, 0.04),
         "chrome_x_m": Normal(0.0, 5 * UM),
     }
-    ranking = rank_importance(design, Process(LEVELS, spreads=spreads), 550e-9)
+    ranking = rank_importance(design, Process(LEVELS, spreads=spreads), 532e-9)
     assert ranking[0].measured == "overlay of mask 4"
-    assert max(ranking, key=lambda one: one.zeroth_order).measured == "depth of mask 4"
+    # A mask that lies off makes two walls of one, whose light goes straight on, too.
+    most = {"scalar": "depth of mask 4", "edges": "overlay of mask 4"}[light]
+    assert max(ranking, key=lambda one: one.zeroth_order).measured == most
     assert {one.measured for one in ranking} == {"overlay of mask 4", "overlay of mask 1", "depth of mask 4"}
     assert sum(one.strehl for one in ranking) == pytest.approx(1)
     assert sum(one.zeroth_order for one in ranking) == pytest.approx(1)

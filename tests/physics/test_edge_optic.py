@@ -327,6 +327,35 @@ def test_what_cannot_be_is_refused():
             replace(lens, **{key: value})
     with pytest.raises(ValueError, match=r"`height_m` must have the grid's shape \(32, 32\)"):
         with_edges(levels(16), lens)
+    with pytest.raises(ValueError, match="`height_m` must be finite everywhere"):
+        with_edges(np.full((32, 32), np.nan), lens)
+
+
+def test_heights_that_are_no_numbers_give_no_light_and_no_slope():
+    """One of them is enough, wherever it lies: an optimiser must see that it diverged."""
+    lens = camera(32, 32, 1e-3)
+    for place in ((0, 0), (31, 17)):
+        height = levels(32)
+        height[place] = np.nan
+
+        def total(height: jax.Array) -> jax.Array:
+            return jnp.sum(jnp.abs(with_edges(height, lens).transmission) ** 2)
+
+        value, slope = jax.value_and_grad(total)(jnp.asarray(height))
+        assert np.isnan(value)
+        assert np.isnan(np.asarray(slope)).any()
+
+
+def test_other_wavelengths_than_those_of_the_camera():
+    lens, red = camera(32, 32, 1e-3), 656e-9
+    own = replace(lens, colours=(Colour("red", (red,), (1.0,)),))
+    found, expected = with_edges(levels(32), lens, wavelengths_m=(red,)), with_edges(levels(32), own)
+    np.testing.assert_array_equal(found.transmission, expected.transmission)
+    assert found.wavelengths_m == (red,)
+    raised = levels(32) + STEP
+    kept = found.with_heights(jnp.asarray(raised)).prepared_for((0.5, np.inf))
+    assert kept.wavelengths_m == (red,)
+    assert found.with_camera(own).wavelengths_m == (red,)
 
 
 def test_other_depths_and_cameras_are_prepared_for():
