@@ -28,6 +28,10 @@ from fab.figure import save
 from fab.files import read_bytes, write_atomic
 
 PROPOSED = "proposed"
+COLUMNS = (
+    *("row", "region", "score", "mean", "low", "high", "pairs", "pictures", "seeds", "gain", "gain_low", "gain_high"),
+    *("parameters", "original_parameters", "why_not"),
+)
 DIGITS = 2e-4  # six digits of each of three numbers are kept
 Lines = list[dict[str, str]]
 
@@ -48,7 +52,11 @@ def read_table(path: str | Path) -> EvaluationTable:
         raise InputError(str(path), rule, Path(path).name, cure)
     number = int(kind[-1])
     found: dict[str, Lines] = {}
-    for line in csv.DictReader(io.StringIO(read_bytes(path).decode())):
+    lines = csv.DictReader(io.StringIO(read_bytes(path).decode()))
+    if lacking := [name for name in COLUMNS if name not in (lines.fieldnames or ())]:
+        cure = "Give table.csv of an evaluation."
+        raise InputError(str(path), f"must have the columns {', '.join(COLUMNS)}", f"no {lacking[0]}", cure)
+    for line in lines:
         found.setdefault(line["row"], []).append(line)
     known = rows_of(number, obstruction, robust=True)
     if unknown := [name for name in found if name not in {row.name for row in known}]:
@@ -68,8 +76,11 @@ def joined(table: EvaluationTable, later: EvaluationTable, names: Sequence[str])
         names: of the rows.
 
     Raises:
-        InputError: a name that the later run has no scores of.
+        InputError: a later run of another table, or a name that it has no scores of.
     """
+    if table.title != later.title:
+        cure = "Give another run; its file is named after its table."
+        raise InputError("later", f"must be a run of {table.title}", later.title, cure)
     scored = {one.row.name: one for one in later.rows if one.scores}
     for name in names:
         if name not in scored:
@@ -77,7 +88,7 @@ def joined(table: EvaluationTable, later: EvaluationTable, names: Sequence[str])
     own = {one.row.name: one for one in table.rows}
     kept = [one for one in table.rows if one.row.name not in names]
     same = [one.run for one in kept if PROPOSED in scored and _as_proposed(one, scored[PROPOSED])]
-    run = same[0] if same else 1 + max(one.run for one in kept)
+    run = same[0] if same else 1 + max((one.run for one in kept), default=0)
     own |= {name: replace(scored[name], run=run) for name in names}
     order = [row.name for row in rows_of(table.number, table.obstruction, robust=True)]
     return replace(table, rows=tuple(own[name] for name in order if name in own))

@@ -60,6 +60,7 @@ from doedesign.spec.training import TrainSpec
 from doedesign.training.loss import adam_step, losses
 from doedesign.training.scores import mean_and_interval, paired_difference, psnr
 from fab.archive import read_archive, write_archive
+from fab.errors import InputError
 from fab.figure import SMALL, panels, save
 from fab.files import canonical_json, csv_table, write_atomic
 from sim.light import srgb_from_linear
@@ -101,6 +102,15 @@ class Plan:
     width: int = 16
     seed: int = 1
     behind: str = "dirt"
+
+    def __post_init__(self) -> None:
+        """Refuse what no picture or training comes of."""
+        if self.size < 40 or self.size % 8:
+            raise InputError("size", "must be a multiple of 8, at least 40", self.size, "For example 128.")
+        least = {"judged": 1, "batch": 1, "width": 1, "steps": 0, "scenes": 1 if self.steps else 0}
+        for name, smallest in least.items():
+            if getattr(self, name) < smallest:
+                raise InputError(name, f"must be at least {smallest}", getattr(self, name), "Give more.")
 
 
 def scenes_of(pictures: Pictures, plan: Plan, count: int, stream: int) -> list[DirtyScene]:

@@ -158,7 +158,7 @@ def calibrate(
     if not isinstance(measurement, Measurement):
         measurement = read_measurement(Path(measurement), design.camera)
     if design.camera.beam is not None:
-        log.warning("the measurement's source lights the plate evenly: the beam of the design is left out")
+        log.warning("the plate is lit as the measurement says (mode_field), not by the beam of the design")
     about = {"level_map_sha256": design.level_map.digest, "light": design.camera.light}
     writing = results_folder(out, design.name, design.folder, **about)
     # Usually seven rounds of derivatives and a step.

@@ -275,6 +275,9 @@ def explain_ratio(
 ) -> ExplanationSet:
     """Find the process errors that would give a measured ring:disc ratio.
 
+    The plate is lit evenly, or by the design's beam. The tip of a fibre (`mode_field` of a measurement) lights the rim
+    less, so a ratio that was measured before one is explained a little off.
+
     Args:
         design: a design, a finished run or its folder.
         targets: what was measured.

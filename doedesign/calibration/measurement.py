@@ -176,11 +176,19 @@ class MeasurementSpec(SpecTable, frozen=True):
     camera: CameraSpec = CameraSpec()
 
     def beam_radius_m(self, depth_m: float) -> float:
-        """Radius of the light on the plate at 1/e² of the irradiance in its middle, for a source at a depth."""
+        """Radius of the light on the plate at 1/e² of the irradiance in its middle, for a source at a depth.
+
+        That far from a fibre, light spreads like that of a point (`least_depth_m`).
+        """
         path_m = depth_m if math.isfinite(depth_m) else self.collimator_m
         if self.mode_field_m is None or path_m is None:
             return math.inf
         return path_m * 2 * self.probe_m / (math.pi * self.mode_field_m)
+
+    @property
+    def least_depth_m(self) -> float:
+        """Depth from which a fibre's light is that of a point to a thousandth of its curvature: 30 Rayleigh lengths."""
+        return 30 * math.pi * ((self.mode_field_m or 0.0) / 2) ** 2 / self.probe_m
 
 
 class Measurement(NamedTuple):
@@ -216,9 +224,16 @@ def _problems(spec: MeasurementSpec) -> Iterator[InputError]:
     if spec.collimator_m is not None and spec.mode_field_m is None:
         cure = 'Add mode_field = "3.5 um", or leave it out.'
         yield InputError("collimator", "goes with a mode_field", format_length(spec.collimator_m), cure)
+    elif spec.collimator_m is not None and all(math.isfinite(image.depth_m) for image in spec.image):
+        rule, cure = "goes with an image at infinity", 'Leave it out, or give an image depth = "inf".'
+        yield InputError("collimator", rule, "none", cure)
     names = [image.called for image in spec.image]
     for i, image in enumerate(spec.image):
         key, count = f"image[{i}]", len(image.files)
+        if image.depth_m < spec.least_depth_m:
+            least, field = format_length(spec.least_depth_m), format_length(spec.mode_field_m or 0.0)
+            rule = f"must be at least {least}, where the light of a mode field of {field} spreads like that of a point"
+            yield InputError(f"{key}.depth", rule, format_length(image.depth_m), "Correct depth or mode_field.")
         if len(image.exposures) != count and not (count == 1 and not image.exposures):
             rule = f"must have one entry per file, {count} here"
             yield InputError(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures.")

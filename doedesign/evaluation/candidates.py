@@ -68,9 +68,10 @@ def candidates_of(
     left: list[Unscored] = []
     for row in rows:
         why = next((missing[name] for name in row.needs if name in missing), "")
-        alone = row.training is None and row.plate == FLAT
+        # What nothing is trained for is the same for every seed.
+        own = seeds if row.needs else (0,) if row.plate == FLAT else seeds[:1]
         found = []
-        for seed in () if why else (0,) if alone else seeds:
+        for seed in () if why else own:
             key = plate_key(row.plate, seed)
             network, weights, seen = _network(plan, row, seed)
             if row.fabricated and not plates[key].fabricated:

@@ -16,7 +16,7 @@ The same call goes on where it was stopped. A row that cannot be computed stands
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,6 +46,7 @@ from doedesign.training.distance.perceptual import Lpips, read_lpips
 from fab.errors import InputError
 from fab.files import canonical_json, read_bytes, sha256_bytes, sha256_file, write_atomic
 from fab.process import Process
+from sim.camera import Camera
 from sim.imaging.convolve import Border
 
 PAIRS, DRAWS = 200, 4
@@ -125,8 +126,8 @@ def evaluate(
     with stoppable():
         design = open_design(run, False, overrides=overrides, free=TRAINING_TABLES)
         assert design.spec is not None  # every run has one
-        if robust is not None:
-            open_design(Path(robust), False)  # said before hours of training
+        if robust is not None:  # said before hours of training
+            _require_same_camera(design, open_design(Path(robust), False), Path(robust))
         given = _sources(folder, images, test, licence)
         lpips = read_lpips(lpips_weights) if lpips_weights else None
         how: Any = {"occlusion": occlusion, "obstruction": obstruction, "seed": seed, "border": border}
@@ -179,6 +180,15 @@ def _require_names(programs: Sequence[ExternalMethod], rows: Sequence[MethodRow]
         if one.name in names:
             raise InputError("method", "must have a name of its own", f'"{one.name}"', "Choose another name.")
         names.append(one.name)
+
+
+def _require_same_camera(design: Design, robust: Design, folder: Path) -> None:
+    """Refuse a robust design for another camera, whose plate would be looked through with this one's cells and lens."""
+    for one in fields(Camera):
+        wanted, got = getattr(design.camera, one.name), getattr(robust.camera, one.name)
+        if wanted != got:
+            cure = "Give a robust design that was made from the same spec."
+            raise InputError(str(folder), f"a robust design must have this camera's {one.name}, {wanted}", got, cure)
 
 
 def _study(design: Design, pairs: PairSet, kind: str, lpips: Lpips | None) -> dict[str, Any]:

@@ -10,6 +10,7 @@ Source:
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -79,8 +80,9 @@ def published_scores(table: int, obstruction: str) -> Mapping[str, PublishedScor
 
     Args:
         table: 1 or 2.
-        obstruction: kind of obstruction; nothing for one that Table 2 has no column of.
+        obstruction: kind of obstruction, or a folder of masks that is named after it; there is nothing for one that
+            Table 2 has no column of.
     """
     if table == 1:
         return TABLE_1
-    return next((rows for kind, rows in TABLE_2.items() if kind in obstruction), {})
+    return next((rows for kind, rows in TABLE_2.items() if kind in Path(obstruction).name), {})

@@ -10,6 +10,7 @@ no camera sees. Rows ending in `_of_capture` are the same methods given what a c
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from fab.errors import InputError
@@ -185,10 +186,11 @@ def table_2(obstruction: str, *, robust: bool = False) -> tuple[MethodRow, ...]:
     """Rows of Table 2 for an obstruction.
 
     Args:
-        obstruction: its name; fences and raindrops have a method of their own.
+        obstruction: its kind, or a folder of masks that is named after it; fences and raindrops have a method of their
+            own.
         robust: whether there is a robust design to judge besides.
     """
-    special = next((row for name, row in _SPECIAL.items() if name in obstruction), None)
+    special = next((row for name, row in _SPECIAL.items() if name in Path(obstruction).name), None)
     return (
         _network("proposed", "Proposed", "proposed"),
         *_process_rows("proposed", "Proposed"),

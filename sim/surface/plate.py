@@ -77,7 +77,7 @@ class FabricatedDoe(ViewedOptic):
         return (rows if self.height_m is not None else rows._replace(coverage=None)), columns
 
     def with_camera(self, camera: Camera) -> "FabricatedDoe":
-        """The same DOE before another lens or sensor, which sees nothing more oblique than its own if it is to be exact.
+        """The same DOE before another lens or sensor; where that sees more oblique light than its own, less exact.
 
         Raises:
             ValueError: another aperture, substrate or kind of light, or light of walls in another polarisation.
@@ -119,8 +119,9 @@ def as_fabricated(
         the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.
 
     Raises:
-        InputError: an error is not finite, an edge moves by half a cell or more through line-width bias, corners are rounded by more than
-            half a cell, a mask is shifted by more than 8 cells, or an error has the wrong number of masks.
+        InputError: an error is not finite, an edge moves by half a cell or more through line-width bias, corners are
+            rounded by more than half a cell, a mask is shifted by more than 8 cells, or an error has the wrong number
+            of masks.
         ValueError: a level map of another shape than the grid.
     """
     if level_map.shape != camera.grid.shape:

@@ -23,7 +23,7 @@ from doedesign.evaluation.external import ExternalMethod
 from doedesign.evaluation.methods import METHODS, MethodInputs, as_seen
 from doedesign.evaluation.pairs import PairSet
 from doedesign.evaluation.plates import PlateBanks, plates_of
-from doedesign.evaluation.published import TABLE_1, TABLE_2
+from doedesign.evaluation.published import TABLE_1, TABLE_2, published_scores
 from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow, rows_of, trainings_of
 from doedesign.evaluation.statistics import BootstrapInterval, bootstrap_mean
 from doedesign.evaluation.tables import LATER, REGIONS, SCORES, EvaluationTable, TableRow
@@ -492,6 +492,30 @@ def test_an_unfinished_robust_design_is_refused_before_anything_is_trained(run: 
     with pytest.raises(InputError, match="robust"):
         evaluate(run, tmp_path / "out", robust=robust, train=True)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_robust_design_of_another_camera_is_refused(run: Path, tmp_path: Path):
+    (tmp_path / "more").mkdir()
+    other = finished_run(tmp_path / "more", SPEC.replace('focal_length = "1 mm"', 'focal_length = "1.1 mm"'))
+    with pytest.raises(
+        InputError, match=r"a robust design must have this camera's focal_length_m, 0.001, but got 0.0011"
+    ):
+        evaluate(run, tmp_path / "out", robust=other, train=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_nothing_is_trained_for_is_scored_once(run: Path, tmp_path: Path):
+    """Two seeds are no two draws of a camera without a network, nor of a robust plate that stays as it is."""
+    names = ("conventional_capture", "robust_capture")
+    table = evaluate(run, tmp_path / "out", pairs=2, rows=names, seeds=(3, 4), robust=run, workers=0)
+    assert [one.row.name for one in table.rows] == [*reversed(names)]
+    assert {one.scores["full"]["psnr"].seeds for one in table.rows} == {1}
+
+
+def test_a_folder_of_masks_is_named_by_its_last_part():
+    assert published_scores(2, "/data/fence_test/raindrop_masks") is published_scores(2, "raindrop")
+    names = {row.name for row in rows_of(2, "/data/fence_test/raindrop_masks")}
+    assert names == {row.name for row in rows_of(2, "raindrop")} != {row.name for row in rows_of(2, "fence")}
 
 
 def test_pictures_to_judge_by_are_none_of_those_trained_on(run: Path, tmp_path: Path):

@@ -38,6 +38,21 @@ def test_a_perfect_bench_shows_the_psf_of_sim_and_noise():
         assert np.mean((counts - electrons) ** 2 / variance) == pytest.approx(1, abs=0.12)
 
 
+def test_exposures_that_would_fill_a_quarter_of_the_frame_are_left_out():
+    design = plate_drawn(64, 8, window=48)
+    process, errors = usual_process(design), Variation()
+    bench = PsfBench.exact(margin=0, bracket=(1.0, 6.0, 60.0, 600.0), background_e_per_s=0.0)
+    for image in bench_measurement(design, process, errors, bench, DEPTHS).images:
+        electrons = image.light * bench.source_e_per_s * image.exposures_s[0]
+        full = [np.mean(electrons * times > (bench.full - bench.black) * bench.gain) for times in bench.bracket]
+        assert len(image.frames) == len(image.darks) == len(image.exposures_s) == sum(share < 0.25 for share in full)
+        assert 1 < len(image.frames) < len(bench.bracket)
+        assert (image.frames[-1] == bench.full).mean() < 0.26  # and noise
+    # Light from elsewhere fills frames, too; one is always taken.
+    lit = replace(bench, background_e_per_s=1e12)
+    assert [len(image.frames) for image in bench_measurement(design, process, errors, lit, DEPTHS).images] == [1, 1]
+
+
 def test_relay_passes_a_strip_of_a_small_aperture():
     # Where the aperture is small beside the lens its rims are straight: what is left is a strip of half width R - f s.
     bench = replace(PAPER, relay_m=1.0, relay_clear_m=2.0)
@@ -113,6 +128,9 @@ def test_a_fit_that_is_told_of_the_fibre_sees_its_light(tmp_path: Path):
     [[image]]
     depth = "2 mm"
     files = ["near.tiff"]
+    [[image]]
+    depth = "inf"
+    files = ["far.tiff"]
     """
     (tmp_path / "measurement.toml").write_text(told)
     spec = load_measurement(tmp_path / "measurement.toml")
@@ -186,5 +204,8 @@ def test_a_bench_that_cannot_be_is_refused():
         PsfBench(bracket=(0.5,))
     with pytest.raises(InputError, match="must be positive, at least one"):
         bench_measurement(design, usual_process(design), Variation(), PAPER, (-1.0,))
+    narrow = replace(PAPER, relay_clear_m=1e-6, within_relay=True)
+    with pytest.raises(InputError, match="relay_clear_m: the relay must leave 16 pixels"):
+        bench_measurement(design, usual_process(design), Variation(), narrow, DEPTHS)
     half = PAPER.scaled(0.5)
     assert (half.relay_m, half.mode_field_m) == (PAPER.relay_m / 2, PAPER.mode_field_m)

@@ -13,6 +13,7 @@ sys.path.insert(0, str(ROOT / "examples"))
 import joined_tables  # noqa: E402
 
 NAME = "table2-fence-paper.csv"
+OTHER = "table2-dirt-radiometric.csv"
 CAPTURES = ["capture_fabricated", "robust_capture", "robust_capture_fabricated"]
 ROBUST = ["robust", "robust_fabricated", "robust_untold"]
 
@@ -41,13 +42,25 @@ def test_rows_of_a_later_run_are_joined(tmp_path: Path):
     assert path.read_bytes() == (RESULTS / NAME).read_bytes()
 
 
+def test_a_table_may_have_nothing_but_the_rows_that_are_joined(tmp_path: Path):
+    later = RESULTS / "later" / "robust" / NAME
+    path = tmp_path / NAME
+    header, *lines = later.read_text().splitlines(keepends=True)
+    path.write_text(header + "".join(line for line in lines if line.startswith("robust,")))
+    assert joined_tables.main([str(path), "--later", str(later), "--rows", "robust"]) == 0
+    assert {one["row"] for one in csv.DictReader(path.read_text().splitlines())} == {"robust"}
+
+
 def test_what_cannot_be_joined_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path, later = tmp_path / NAME, RESULTS / "later" / "biharmonic" / NAME
     path.write_bytes((RESULTS / NAME).read_bytes())
     for given, words in (
         ([str(path), "--later", str(later), "--rows", "robust"], "must be among"),
         ([str(path), "--later", str(tmp_path / "robust.csv"), "--rows", "robust"], "must be named like"),
+        ([str(path), "--later", str(RESULTS / OTHER), "--rows", "robust"], "must be a run of Table 2: fence"),
+        ([str(path), "--later", str(tmp_path / NAME.replace("2", "1")), "--rows", "robust"], "no score"),
     ):
+        (tmp_path / NAME.replace("2", "1")).write_text("row,region\n")
         assert joined_tables.main(given) == 2
         assert words in capsys.readouterr().err
     assert path.read_bytes() == (RESULTS / NAME).read_bytes()

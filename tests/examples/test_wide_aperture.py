@@ -11,6 +11,7 @@ import pytest
 
 from doedesign.capture.images import Pictures, sample_files
 from doedesign.spec import load_spec
+from fab.errors import InputError
 from sim.source import path_at_m
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -48,7 +49,7 @@ def test_every_camera_exposes_as_long():
 
 
 def test_scenes_are_about_dirt_and_what_is_believed_of_it_is_off():
-    plan = wide_aperture.Plan(size=32)
+    plan = wide_aperture.Plan(size=40)
     pictures = Pictures(sample_files()[:1], 256)
     scenes = wide_aperture.scenes_of(pictures, plan, 3, 0)
     again = wide_aperture.scenes_of(pictures, plan, 3, 0)
@@ -64,13 +65,38 @@ def test_scenes_are_about_dirt_and_what_is_believed_of_it_is_off():
 def test_bars_are_straight_and_at_one_distance():
     """4 mm at 8 cm are 216 pixels of 3.7 um; coarse ones are eight of them wide."""
     pictures = Pictures(sample_files()[:1], 256)
-    for scene in wide_aperture.scenes_of(pictures, wide_aperture.Plan(size=32, behind="bars"), 3, 0):
+    for scene in wide_aperture.scenes_of(pictures, wide_aperture.Plan(size=40, behind="bars"), 3, 0):
         assert scene.near_m == pytest.approx(0.08)
         share = float(np.mean(scene.blocked))
         # 4 of 12 to 16 mm; the layer is one and a half to two meshes wide, with a bar in its middle.
         assert 0.2 < share < 0.5
         middle = scene.blocked[dirty_scenes.DIRT_PX // 2, dirty_scenes.DIRT_PX // 2]
         assert middle > 0.4
+
+
+@pytest.mark.parametrize("wrong", [{"size": 32}, {"size": 44}, {"judged": 0}, {"scenes": 0}, {"steps": -1}])
+def test_a_plan_that_nothing_comes_of_is_refused(wrong: dict[str, int]):
+    with pytest.raises(InputError, match=f"{next(iter(wrong))}: must be"):
+        wide_aperture.Plan(**wrong)
+    assert wide_aperture.Plan(scenes=0, steps=0).scenes == 0
+
+
+def test_plates_as_fabricated_are_judged_together():
+    """Picture by picture, over the depths and at the one that is worst for each."""
+    rows = [
+        wide_aperture.Judged(camera, plate, "filter", 1.0, depth, scene, psnr + scene)
+        for camera, plate, psnrs in (
+            ("stop", "drawn", (20.0, 21.0)),
+            ("plate", "fabricated 0", (22.0, 22.0)),
+            ("plate", "fabricated 1", (23.0, 24.0)),
+        )
+        for depth, psnr in zip((2.0, np.inf), psnrs, strict=True)
+        for scene in range(3)
+    ]
+    found = wide_aperture.summary_of(rows)
+    name = "plate / as fabricated / filter / 1.0 over stop"
+    assert found["worst depth, plate over rival"][name][:3] == pytest.approx([2.5, 2.5, 2.5])
+    assert found["mean of the depths, plate over rival"][name][:3] == pytest.approx([2.25, 2.25, 2.25])
 
 
 def test_the_spec_says_what_is_designed():

@@ -267,7 +267,7 @@ def test_a_camera_of_another_polarisation_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("radius_m", [0.0, 49e-3])
 def test_walls_much_higher_than_drawn(radius_m: float):
-    """Up to 1.6 times as deep, by errors of the depth and of its evenness: the drawn DOE of such levels has the same light."""
+    """Up to 1.6 times as deep, by errors of depth and evenness: a DOE drawn with such levels has the same light."""
     scale, bowl = 0.24, 0.3
     lens = small(aperture=1.6 * 64 * CELL, colours=(Colour("blue", (BLUE,), (1.0,)),))
     level = np.pad(level_map()[8:-8, 8:-8], 8, constant_values=15)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
 _FULL = 0.7  # of a pixel's range, that the brightest pixel reaches in the shortest exposure
+_MOST_FULL = 0.25  # of a frame's pixels, that may be full in a longer one
 
 
 class BenchRow(NamedTuple):
@@ -141,6 +142,7 @@ class BenchMeasurement:
         yield f"saturation = {bench.full}"
         if bench.mode_field_m:
             yield f'mode_field = "{bench.mode_field_m / UM:.9g} um"'
+        if bench.mode_field_m and any(math.isinf(image.depth_m) for image in self.images):
             yield f'collimator = "{bench.collimator_m * 1e3:.9g} mm"'
         if self.window is not None:
             yield f"window = {self.window} # that the relay passes whole"
@@ -163,17 +165,17 @@ class BenchMeasurement:
         from matplotlib.patheffects import withStroke
 
         rim, bench, columns = [withStroke(linewidth=2, foreground="black")], self.bench, len(self.images)
+        rows = max(len(image.frames) for image in self.images)
         norm = LogNorm(bench.read_noise / bench.gain, bench.full - bench.black, clip=True)
         title = f"{self.name} on the PSF bench, {length_text(bench.probe_m)}"
         note = "as the camera has them, the relay's half turn included; a full pixel is white"
-        with panels(
-            ax, (0.9 + 2.35 * columns, 0.9 + 2.3 * len(bench.bracket)), title, note, layout="compressed"
-        ) as figure:
-            rows = [*range(len(bench.bracket))]
-            grid = figure.subplots(len(rows), columns, squeeze=False)
+        with panels(ax, (0.9 + 2.35 * columns, 0.9 + 2.3 * rows), title, note, layout="compressed") as figure:
+            grid = figure.subplots(rows, columns, squeeze=False)
             shown = None
             for image, panes in zip(self.images, grid.T, strict=True):
-                for axes, number in zip(panes, rows, strict=True):
+                for axes in panes[len(image.frames) :]:  # it would show little but full pixels
+                    axes.set_axis_off()
+                for number, axes in enumerate(panes[: len(image.frames)]):
                     counts = np.maximum(image.frames[number].astype(np.float64) - bench.black, 1e-3)
                     extent = extent_of(counts.shape, self.pixel_m, 1.0)
                     shown = axes.imshow(counts, cmap=LIGHT, norm=norm, extent=extent, interpolation="auto")
@@ -185,9 +187,10 @@ class BenchMeasurement:
                     axes.text(0.03, 0.03, time, **style)
                     bare(axes)
                 panes[0].set_title(length_text(image.depth_m) if math.isfinite(image.depth_m) else "collimated")
-            scale_bar(grid[-1, 0], self.images[0].light.shape[1] * self.pixel_m)
-            for axes, times in zip(grid[:, 0], bench.bracket, strict=True):
-                axes.set_ylabel(f"{times:g} times the shortest" if times != 1 else "shortest exposure")
+            scale_bar(grid[0, 0], self.images[0].light.shape[1] * self.pixel_m)
+            for number, times in enumerate(bench.bracket[:rows]):
+                first = next(k for k, image in enumerate(self.images) if len(image.frames) > number)
+                grid[number, first].set_ylabel(f"{times:g} times the shortest" if times != 1 else "shortest exposure")
             assert shown is not None
             figure.colorbar(shown, ax=grid.ravel().tolist(), shrink=0.7, aspect=30, label="counts above black")
         return figure
@@ -225,6 +228,7 @@ def bench_measurement(
         rule, cure = "the bench's camera has a lens", "Choose a design with a focal length."
         raise InputError("bench", rule, design.camera.lens_text, cure)
     camera, rng = bench_camera(design, bench), np.random.default_rng(seed)
+    window = clear_window(camera, bench) if bench.within_relay else None  # refuses before minutes of work
     plate = replace(design, camera=camera).fabricated(process, variation=errors, depths=depths_m)
     through = bench_throughput(plate, bench)
     # Faces and relay are in the light; what else is lost makes it dimmer.
@@ -235,7 +239,6 @@ def bench_measurement(
         open_, light = bench_light(plate, bench, depth + off)
         name = f"{number}_{'far' if math.isinf(depth) else _depth_text(depth).replace(' ', '')}"
         images.append(_photographed(name, (depth, depth + off), (open_, light), dimmer, plate.camera, bench, rng))
-    window = clear_window(camera, bench) if bench.within_relay else None
     return BenchMeasurement(bench, camera.pixel_m, window, errors, tuple(images), through, design.name)
 
 
@@ -256,15 +259,22 @@ def _photographed(
     caught = -math.expm1(-2 * (radius / edge) ** 2) if math.isfinite(edge) else 1.0
     rate = bench.source_e_per_s * caught * dimmer
     shortest = _FULL * (bench.full - bench.black) * bench.gain / (rate * float(light.max()))
-    exposures = tuple(float(f"{shortest * times:.3g}") for times in bench.bracket)
     # The relay turns the picture by half a turn.
     turned = light[::-1, ::-1]
+    per_s = turned * rate + bench.background_e_per_s
+
+    def shows_enough(times: float) -> bool:
+        return float(np.mean(per_s * shortest * times >= (bench.full - bench.black) * bench.gain)) <= _MOST_FULL
+
+    first, *longer = bench.bracket
+    bracket = (first, *(times for times in longer if shows_enough(times)))
+    exposures = tuple(float(f"{shortest * times:.3g}") for times in bracket)
 
     def counts(electrons: Float[np.ndarray, "y x"]) -> UInt16[np.ndarray, "y x"]:
         seen = rng.poisson(np.maximum(electrons, 0.0)) + rng.normal(0, bench.read_noise, electrons.shape)
         return np.clip(np.rint(seen / bench.gain) + bench.black, 0, bench.full).astype(np.uint16)
 
-    frames = np.stack([counts((turned * rate + bench.background_e_per_s) * seconds) for seconds in exposures])
+    frames = np.stack([counts(per_s * seconds) for seconds in exposures])
     darks = np.stack([counts(np.zeros_like(light)) for _ in exposures])
     row = BenchRow(
         name=name,

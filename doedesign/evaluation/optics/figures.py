@@ -6,6 +6,7 @@ bench/      measurement.toml, *.tiff, hidden.toml, images.csv, figure.png     a 
 """
 
 import logging
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -64,10 +65,10 @@ def figure(
     else:
         _log.info("photographing a plate on the bench")
         made_by = design.process(process)
-        share = min(1.0, design.camera.focal_length_m / _LENS_M)
-        paper = PsfBench(within_relay=True)  # what the relay stops would be taken for errors
-        bench = paper if share == 1 else paper.scaled(share)
-        measured = bench_measurement(design, made_by, bench_errors(design, made_by, seed), bench, seed=seed)
+        # What the relay stops would be taken for errors. A longer lens has a wider aperture, and takes a larger bench.
+        bench = PsfBench(within_relay=True).scaled(design.camera.focal_length_m / _LENS_M)
+        errors, depths = bench_errors(design, made_by, seed), (*design.near_m, math.inf)
+        measured = bench_measurement(design, made_by, errors, bench, depths, seed)
         tables, picture = {"images.csv": csv_table(measured.rows, 6)}, measured.plot()
         tables["throughput.json"] = canonical_json(measured.throughput._asdict()).decode()
         writers.append(measured.write)

@@ -69,7 +69,8 @@ class PsfBench:
         read_noise: electrons, standard deviation of a reading.
         black: counts without light.
         full: counts from which a pixel is full.
-        bracket: exposures over the shortest, which is chosen for every image.
+        bracket: exposures over the shortest, which is chosen for every image; longer ones that would fill more than
+            a quarter of the frame are left out.
         within_relay: whether the description limits what is compared to the window that the relay passes whole. A
             relay that takes the corners from a window that is compared is taken for errors of the plate.
     """
@@ -93,7 +94,7 @@ class PsfBench:
     read_noise: float = 4.0
     black: int = 64
     full: int = 4095
-    bracket: tuple[float, ...] = (1.0, 6.0, 60.0)
+    bracket: tuple[float, ...] = (1.0, 6.0, 60.0, 600.0)
     within_relay: bool = False
 
     def __post_init__(self) -> None:
@@ -105,7 +106,7 @@ class PsfBench:
         if self.throughput is not None and not 0 < self.throughput <= 1:
             raise InputError("throughput", "must be a share", self.throughput, "For example 0.86, or None.")
         if not self.bracket or min(self.bracket) < 1:
-            cure = "For example (1.0, 6.0, 60.0)."
+            cure = "For example (1.0, 6.0, 60.0, 600.0)."
             raise InputError("bracket", "must be exposures over the shortest, 1 or more", self.bracket, cure)
 
     @classmethod

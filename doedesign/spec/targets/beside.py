@@ -11,17 +11,17 @@ from fab.units import format_length
 if TYPE_CHECKING:
     from doedesign.spec.models import Spec
 
-# Keys of [optimize] that spots, areas and foci decide themselves, with their usual values.
+# Keys of [optimize] that spots, areas and foci decide themselves.
 _OWN = (
-    ("parametrization", "freeform"),
-    ("start", "flat"),
-    ("learning_rate", 0.1),
-    ("quantisation", "straight_through"),
-    ("sampling", "sparse"),
-    ("colours", "together"),
-    ("polish", 0),
-    ("min_feature_m", None),
-    ("drawn_pixel_m", None),
+    "parametrization",
+    "start",
+    "learning_rate",
+    "quantisation",
+    "sampling",
+    "colours",
+    "polish",
+    "min_feature_m",
+    "drawn_pixel_m",
 )
 
 
@@ -40,10 +40,12 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
         yield InputError("optics.propagation", rule, got, "Leave it out.")
     if spec.process.chooses_depths:
         yield InputError("process.etch_depths", "the depths must be known", '"optimize"', "Give them, or leave it out.")
-    for name, usual in _OWN:
-        if (got := getattr(spec.optimize, name)) != usual:
+    for name in _OWN:
+        got = getattr(spec.optimize, name)
+        if got != type(spec.optimize).model_fields[name].default:
             rule = "spots, areas and foci have starts, steps and levels of their own"
-            yield InputError(f"optimize.{toml_key(name)}", rule, f'"{got}"', "Leave it out.")
+            shown = f'"{got}"' if isinstance(got, str) else format_length(got) if name.endswith("_m") else got
+            yield InputError(f"optimize.{toml_key(name)}", rule, shown, "Leave it out.")
 
 
 def in_focus(spec: "Spec") -> Iterator[InputError]:
