@@ -5,6 +5,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_bars_are_straight_and_at_one_distance():
 
 
 @pytest.mark.parametrize("wrong", [{"size": 32}, {"size": 44}, {"judged": 0}, {"scenes": 0}, {"steps": -1}])
-def test_a_plan_that_nothing_comes_of_is_refused(wrong: dict[str, int]):
+def test_a_plan_that_nothing_comes_of_is_refused(wrong: dict[str, Any]):
     with pytest.raises(InputError, match=f"{next(iter(wrong))}: must be"):
         wide_aperture.Plan(**wrong)
     assert wide_aperture.Plan(scenes=0, steps=0).scenes == 0
