@@ -95,13 +95,13 @@ def write_atomic(path: str | Path, data: bytes) -> None:
 
 
 def _made_file(path: Path) -> tuple[Path, int]:
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.doedesign-file.", dir=path.parent)
     return Path(name), handle
 
 
 def _made_folder(path: Path, what: str) -> tuple[Path, int]:
     while True:
-        name = tempfile.mkdtemp(prefix=f".{path.name}.{what}.", dir=path.parent)
+        name = tempfile.mkdtemp(prefix=f".{path.name}.doedesign-{what}.", dir=path.parent)
         with contextlib.suppress(FileNotFoundError):  # cleared by another process before it was opened
             return Path(name), os.open(name, os.O_RDONLY)
 
@@ -132,7 +132,7 @@ def lock(handle: int) -> bool | None:
 
 def _clear_killed(path: Path) -> None:
     """Remove what killed processes were writing to a path; an earlier result that one had moved aside comes back."""
-    unfinished = re.compile(rf"\.{re.escape(path.name)}\.((new|old)\.)?[a-z0-9_]{{8}}")
+    unfinished = re.compile(rf"\.{re.escape(path.name)}\.doedesign-(file|new|old)\.[a-z0-9_]{{8}}")
     for entry in [Path(entry) for entry in os.scandir(path.parent) if unfinished.fullmatch(entry.name)]:
         with contextlib.suppress(OSError):  # another process clears it, or may not
             handle = os.open(entry, os.O_RDONLY | os.O_NOFOLLOW)

@@ -186,7 +186,7 @@ def _write_captures(
 def _require_own(folder: Path, digest: str) -> None:
     """Refuse a folder of something else, and clear away what a killed simulation was writing."""
     for path in folder.iterdir():
-        if path.name.startswith(".") and (".new." in path.name or path.name.startswith((".manifest", ".contact"))):
+        if path.name.startswith(".") and ".doedesign-" in path.name:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
     if not (folder / MANIFEST_NAME).is_file():
         if any(folder.iterdir()):

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from fab.layout.geometry import Cell
 
 # A drawing of this package has about ten cells, five deep, a die per millimetre of the wafer, ten thousand copies of a
-# cell in each at most, and a few hundred polygons that are no rectangles. Rectangles have no limit: a file has at least
-# ten bytes for each, or the manifest says how many there are.
+# cell in each of 34 ways to draw the DOE at most, and a few hundred polygons that are no rectangles. Rectangles have no
+# limit: a file has at least ten bytes for each, or the manifest says how many there are.
 MOST: Mapping[str, int] = {
     "cells": 2_000,
     "cells placed one within another": 32,
-    "placed copies": 100_000,
+    "placed copies": 500_000,
     "copies through all levels": 100_000_000,
     "polygons that are no rectangles": 20_000,
 }

@@ -3,12 +3,14 @@
 A line-width split moves every edge of every etched area a little further out, or in. Where a process strays from the
 line width that the masks were drawn for, one of these dies comes nearer to the design than the plate as ordered.
 
-The control of the etch order gives the plane of the deepest etch to the mask of the shallowest, and so on. If the lab
-took the depths in the opposite order, this die holds the plate as designed and all others do not.
+The control of the etch order gives the plane of the deepest etch to the mask of the shallowest, the plane of the next
+to the mask of the next, and so on. If the lab took the depths in the opposite order, this die holds the plate as
+designed and all others do not.
 """
 
 from dataclasses import dataclass
 
+from fab.errors import InputError
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.units import format_length
@@ -30,7 +32,11 @@ class DieSplit:
 
 
 def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float) -> tuple[DieSplit, ...]:
-    """List the ways to draw a wafer's dies: as ordered (edges moved by `moves`), line-width splits, order control."""
+    """List the ways to draw a wafer's dies: as ordered (edges moved by `moves`), line-width splits, order control.
+
+    Raises:
+        InputError: a control of the order in which a single depth is etched.
+    """
     bits = tuple(range(levels.bits))
     splits = [DieSplit("DOE", "", "", bits, moves)]
     for number, move_m in enumerate(wafer.line_splits_m, 1):
@@ -40,6 +46,11 @@ def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float
         lettering = f"EDGES {'+' if out else '-'}{length}".upper()
         splits.append(DieSplit(f"CD{number}", words, lettering, bits, tuple(m + units for m in moves)))
     if wafer.order_control:
+        if levels.bits == 1:
+            cure = "Leave order_control out."
+            raise InputError("wafer: order_control", "needs two masks or more, for their order", "one mask", cure)
         words = "planes in the opposite order: right only if the depths were etched in the opposite order"
-        splits.append(DieSplit("ORDER", words, "DEPTHS REVERSED", bits[::-1], moves))
+        by_depth = sorted(bits, key=levels.etch_depth_m)
+        planes = dict(zip(by_depth, reversed(by_depth), strict=True))
+        splits.append(DieSplit("ORDER", words, "DEPTHS REVERSED", tuple(planes[bit] for bit in bits), moves))
     return tuple(splits)

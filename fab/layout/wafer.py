@@ -7,12 +7,12 @@ from typing import ClassVar, Literal
 
 from fab.errors import InputError
 from fab.files import IF_ANY
-from fab.layout.limits import MOST
 from fab.units import MM, UM, format_length
 
 # Primary flats of SEMI M1 by diameter, both in millimetres; larger wafers have a notch.
 _FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}
 _MOST_SPLITS = 32
+_MOST_DIES = 100_000
 _NOTCH_M, _NOTCHED_M = 1 * MM, 199 * MM
 _FARTHEST_M = 100 * UM  # that an edge is moved
 
@@ -72,8 +72,8 @@ class Wafer:
             raise InputError("wafer: blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
         if self.dies is not None and not all(isinstance(n, Integral) and n >= 1 for n in self.dies):
             raise InputError("wafer: dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
-        if self.dies is not None and self.dies[0] * self.dies[1] > MOST["placed copies"]:
-            rule = f"must be at most {MOST['placed copies']} altogether"
+        if self.dies is not None and self.dies[0] * self.dies[1] > _MOST_DIES:
+            rule = f"must be at most {_MOST_DIES} altogether"
             raise InputError("wafer: dies", rule, self.dies, "Let the wafer be filled.")
         if len(self.line_splits_m) > _MOST_SPLITS:
             rule, got = f"must be at most {_MOST_SPLITS}", len(self.line_splits_m)

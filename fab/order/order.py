@@ -21,7 +21,7 @@ from fab.level_map import LevelMap
 from fab.order.formats import Formats
 from fab.order.terms import OrderTerms
 from fab.process import Process
-from fab.rules.check import RulesReport, check
+from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair import Repair, repaired
 from fab.runsheet.tables import Predictions
 from fab.solids.patch import Patch
@@ -123,6 +123,26 @@ class Order:
         own = usual.cd_bias_m or (0.0,) * self.process.masks
         return edge_moves([float(usual.common_cd_bias_m + bias) for bias in own], self.dbu_m)
 
+    def narrowed(self) -> tuple[str, ...]:
+        """One sentence for every mask whose moved edges leave a line or a space too narrow for the process to print."""
+        found, usual = [], self.process.expected()
+        own = usual.cd_bias_m or (0.0,) * self.process.masks
+        for split in self.splits:
+            for mask, (bit, move) in enumerate(zip(split.bits, split.moves, strict=True)):
+                plane, grown_m = self.rules.planes[bit], move * self.dbu_m + usual.common_cd_bias_m + own[mask]
+                for what, widths, sign in (("line", plane.line, 1), ("space", plane.space, -1)):
+                    least = widths.minimum_m
+                    if not move or widths.smallest_m is None or widths.smallest_m < least:
+                        continue  # not moved, or said already
+                    printed = widths.smallest_m + 2 * sign * grown_m
+                    if printed < least - 1e-12:
+                        where = f" ({split.words})" if split.words else ""
+                        found.append(
+                            f"mask {mask + 1}{where}: its edges are moved so far that its narrowest {what} prints "
+                            f"{format_length(max(printed, 0.0))} wide, below the {format_length(least)} of the process"
+                        )
+        return tuple(found)
+
     @property
     def dbu_m(self) -> float:
         """Database unit of the drawing, metres."""
@@ -164,13 +184,15 @@ class Order:
     @cached_property
     def geometry(self) -> str:
         """SHA-256 of all that the drawing is made from: level map, pixels, depths, chrome, wafer and process."""
-        level_map, process = self.level_map, self.process
+        level_map, process, levels = self.level_map, self.process, self.level_map.levels
         drawn = {
             "level map": level_map.digest,
             "shape": level_map.grid.shape,
             "pitch": level_map.grid.pitch_m,
             "aperture": level_map.relief.record(),
             "depths": level_map.levels.depths_m,
+            # Planes are counted from the top level down; of other counts than powers of two the depths do not tell it.
+            **({} if levels.count == 2**levels.bits else {"levels": levels.count}),
             "chrome": asdict(self.chrome),
             # Moves of edges, asked for or against the bias, stand with the process.
             "wafer": {name: value for name, value in asdict(self.wafer).items() if name != "edge_moves_m"},
@@ -219,7 +241,8 @@ def plan_order(
             fail.
     """
     made_by = process_from(process, level_map.levels)
-    report = check(level_map, made_by)
+    wafer, terms = wafer or Wafer(), terms or OrderTerms()
+    report = check(level_map, replace(Rules.from_process(made_by), address_m=terms.address_grid_m))
     inside = level_map.level[level_map.relief.inside(level_map.grid)]
     if inside.size and inside.min() == inside.max():
         log.warning("every pixel of %s has level %d: it does to light what flat glass does", level_map.name, inside[0])
@@ -228,10 +251,20 @@ def plan_order(
     if on_violation == "fail" and not report.printable:
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
-    wafer, terms = wafer or Wafer(), terms or OrderTerms()
     asked: dict[str, Any] = {"patch": patch, "terms": terms, "papers": papers, "direct_write": direct_write}
     asked["formats"] = formats or Formats()
     order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
+    if narrowed := order.narrowed():
+        if on_violation == "fail":
+            cure = "Move edges less, or choose another process."
+            raise InputError("masks", "the process must be able to print them", narrowed[0], cure)
+        for sentence in narrowed:
+            log.warning(sentence)
+    off, address = report.off_grid, terms.address_grid_m
+    if address is not None and off.edges:
+        grid, worst = format_length(address), format_length(off.worst_m)
+        said = "%d of %d lines of pixels lie off the mask writer's grid of %s, which will move them by up to %s"
+        log.warning(said, off.edges, off.of, grid, worst)
     if warning := faint_marks(order.photomasks):
         log.warning(warning)
     deep_m = level_map.levels.total_m

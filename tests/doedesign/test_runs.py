@@ -156,7 +156,7 @@ def test_only_temporary_files_are_cleared_away(run: Run):
     swept = [".checkpoint.npz.abcd_123", ".manifest.json.00000000", ".height_continuous.exr.zzzzzzzz"]
     for name in kept + swept:
         run.path(name).write_text("")
-    run.path(".psf.new.abcdefgh").mkdir()
+    run.path(".psf.doedesign-new.abcdefgh").mkdir()
     with alone_in(run.folder):
         assert {path.name for path in run.folder.iterdir()} == {*kept, "manifest.json", "spec.toml"}
 

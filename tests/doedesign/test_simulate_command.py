@@ -137,7 +137,7 @@ def test_same_seed_same_bytes_and_a_stopped_one_goes_on(run: Path, images: Path,
     first, second = sorted(path for path in (tmp_path / "b").iterdir() if path.is_dir())
     shutil.rmtree(first)
     (second / "mask.exr").write_bytes(b"cut off")
-    (tmp_path / "b" / ".0002_x.new.abcdefgh").mkdir()
+    (tmp_path / "b" / ".0002_x.doedesign-new.abcdefgh").mkdir()
     simulate(run, tmp_path / "b", images)
     assert content(tmp_path / "b") == whole
     # A damaged description, which the contact sheet would have believed.

@@ -24,7 +24,7 @@ from fab.units import NM, UM
 from tests.campaign import bombs
 
 SAYS = {
-    "nested_arrays": "at most 100000 placed copies",
+    "nested_arrays": "at most 500000 placed copies",
     "doublings": "at most 100000000 copies through all levels",
     "chain": "at most 32 cells placed one within another",
     "many_cells": "at most 2000 cells",

@@ -161,10 +161,11 @@ def test_an_empty_folder_may_be_filled(tmp_path):
 
 
 def test_what_a_killed_process_was_writing_is_cleared_by_the_next(tmp_path):
-    (tmp_path / ".out.new.abcd_123").mkdir()
-    (tmp_path / ".out.new.abcd_123" / "half.gds").write_text("half")
-    (tmp_path / ".file.bin.k2_x81ab").write_bytes(b"half")
-    others = {".outer.new.abcd_123", ".out.new.mine", ".file.bin.backup1.old"}
+    (tmp_path / ".out.doedesign-new.abcd_123").mkdir()
+    (tmp_path / ".out.doedesign-new.abcd_123" / "half.gds").write_text("half")
+    (tmp_path / ".file.bin.doedesign-file.k2_x81ab").write_bytes(b"half")
+    others = {".outer.doedesign-new.abcd_123", ".out.doedesign-new.mine", ".file.bin.backup1.old"}
+    others |= {".file.bin.original", ".out.original", ".out.previous", ".out.new.abcd_123"}  # of people
     for name in others:
         (tmp_path / name).write_text("mine")
     with atomic_folder(tmp_path / "out") as fresh:
@@ -189,7 +190,7 @@ def test_an_earlier_result_comes_back_whenever_its_replacement_is_stopped(tmp_pa
         (fresh / "manifest.json").write_text("{}")
 
     def stopped(source, target):
-        if source.name.startswith(".out.new."):
+        if source.name.startswith(".out.doedesign-new."):
             raise KeyboardInterrupt
         return rename(source, target)
 
@@ -198,8 +199,8 @@ def test_an_earlier_result_comes_back_whenever_its_replacement_is_stopped(tmp_pa
         with pytest.raises(KeyboardInterrupt), atomic_folder(path) as fresh:
             (fresh / "x").write_text("1")
     assert (path / "manifest.json").exists()
-    (tmp_path / ".out.old.abcd_123").mkdir()
-    path.rename(tmp_path / ".out.old.abcd_123" / "out")
+    (tmp_path / ".out.doedesign-old.abcd_123").mkdir()
+    path.rename(tmp_path / ".out.doedesign-old.abcd_123" / "out")
     with pytest.raises(RuntimeError):
         break_off(path)
     assert [found.name for found in path.iterdir()] == ["manifest.json"]

@@ -1,5 +1,6 @@
 """Dies that draw the DOE differently on purpose: line-width splits, and the control of the etch order."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -16,6 +17,8 @@ from fab.layout.split import splits_of
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
+from fab.order.order import plan_order
+from fab.order.terms import OrderTerms
 from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.process import Normal, Process
@@ -119,6 +122,52 @@ def test_splits_leave_a_die_as_ordered():
     with pytest.raises(InputError, match="at most 100000 altogether"):
         Wafer(dies=(1000, 101))
     assert [one.code for one in splits_of(Wafer(), LEVELS, (0,) * 4, 1e-9)] == ["DOE"]
+
+
+def test_the_control_of_the_order_gives_every_mask_the_plane_of_the_opposite_depth():
+    """Whatever bits the depths belong to; a single depth has no order."""
+    levels = Levels(8, 75e-9, (300e-9, 75e-9, 600e-9))
+    (_, control) = splits_of(Wafer(order_control=True), levels, (0, 0, 0), 1e-9)
+    given = {levels.etch_depth_m(mask): levels.etch_depth_m(plane) for mask, plane in enumerate(control.bits)}
+    assert given == {75e-9: 600e-9, 300e-9: 300e-9, 600e-9: 75e-9}
+    with pytest.raises(InputError, match="order_control: needs two masks or more"):
+        splits_of(Wafer(order_control=True), Levels(2, 600e-9), (0,), 1e-9)
+
+
+def test_moved_edges_must_leave_what_the_process_prints(tmp_path, caplog):
+    """Lines and spaces of 1 um, as fine as it prints; what makes up for a bias is none of it."""
+    stripes = np.tile(np.repeat([0, 1], 1), (32, 16)).astype(np.uint8)
+    plate = wide_map(stripes, Levels(2, 600e-9), Grid((32, 32), 1e-6), "s")
+    fine = Process(Levels(2, 600e-9), minimum_line_m=1e-6, minimum_space_m=1e-6)
+    wider = replace(fine, spreads={"common_cd_bias_m": Normal(0.2e-6, 0.0)})
+    for process, wafer, said in (
+        (fine, Wafer(), None),
+        (fine, Wafer(edge_moves_m=(0.4e-6,)), "narrowest space prints 200 nm wide, below the 1 um"),
+        (fine, Wafer(line_splits_m=(-0.45e-6,)), r"450 nm further in .*narrowest line prints 100 nm wide"),
+        (wider, Wafer(compensate=True), None),
+    ):
+        caplog.clear()
+        plan_order(plate, process=process, wafer=wafer, on_violation="fail" if said is None else "warn")
+        assert bool(said) == any(re.search(said or "edges are moved", message) for message in caplog.messages)
+        if said:
+            with pytest.raises(InputError, match=said):
+                plan_order(plate, process=process, wafer=wafer, on_violation="fail")
+
+
+def test_lines_off_the_grid_of_the_mask_writer_are_told(caplog):
+    plate = wide_map(np.zeros((8, 8), np.uint8), Levels(2, 600e-9), Grid((8, 8), 1.03e-6), "s")
+    plan_order(plate)
+    assert "mask writer's grid" not in caplog.text
+    order = plan_order(plate, terms=OrderTerms(address_grid_m=100e-9))
+    assert "lie off the mask writer's grid of 100 nm, which will move them by up to 40 nm" in caplog.text
+    assert order.rules.off_grid.address_m == 100e-9
+
+
+def test_staircases_of_other_counts_are_other_jobs():
+    """Six and seven levels of the same map and depths: planes are counted from the top level down."""
+    level = np.random.default_rng(0).integers(0, 6, (8, 8)).astype(np.uint8)
+    maps = [wide_map(level, Levels(count, 75e-9), Grid((8, 8), 1e-6), "s") for count in (6, 7, 8)]
+    assert len({plan_order(one).geometry for one in maps}) == 3
 
 
 def test_a_split_that_closes_a_gap_is_refused(tmp_path):

@@ -144,8 +144,8 @@ def test_what_a_killed_process_was_writing_is_cleared_away(copied, tiny, cli, co
     before = content(copied.run)
     (copied.run / ".checkpoint.npz.k2_x81ab").write_bytes(b"half")
     (copied.run / ".manifest.json.00000000").write_bytes(b"")
-    (copied.run / ".psf.new.abcdefgh").mkdir()
-    (copied.run / ".psf.new.abcdefgh" / "continuous.exr").write_bytes(b"half")
+    (copied.run / ".psf.doedesign-new.abcdefgh").mkdir()
+    (copied.run / ".psf.doedesign-new.abcdefgh" / "continuous.exr").write_bytes(b"half")
     assert cli("optimize", tiny, "--out", copied.run).code == 0
     assert content(copied.run) == before
 
