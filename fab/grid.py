@@ -59,6 +59,8 @@ class Grid:
             raise InputError("grid: shape", rule, self.shape, "Give integers, such as array.shape.")
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
+        object.__setattr__(self, "shape", (int(ny), int(nx)))  # of numpy, they would not go into JSON
+        object.__setattr__(self, "pitch_m", float(self.pitch_m))
         if not _PITCHES_M[0] <= self.pitch_m <= _PITCHES_M[1]:
             raise InputError(
                 "grid: pitch", "must be positive, from 1e-20 m to 1e20 m", self.pitch_m, "Give the pixel pitch."

@@ -5,6 +5,7 @@ top row down, as pictures are, so it is turned: up in the picture is +y. Numbers
 metres that one count stands for: a 16-bit picture whose full scale 65535 means 1.2 um has the scale 1.2e-6 / 65535.
 """
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,8 @@ from fab.units import format_length, metres
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
+
+log = logging.getLogger("doedesign")
 
 _PICTURES = (".png", *TIFF_FILES)
 
@@ -160,7 +163,28 @@ def read_height(
         height_m *= scale_m
     require_heights(height_m, str(path))
     grid = Grid((height_m.shape[0], height_m.shape[1]), metres(pitch, "pitch"))
-    return HeightMap(height_m, grid, min(grid.extent_m) if aperture is None else outline_on(grid, aperture))
+    return HeightMap(height_m, grid, outline_of(height_m, grid, aperture, str(path)))
+
+
+def outline_of(height_m: NDArray[Any], grid: Grid, aperture: Aperture | float | str | None, where: str) -> Aperture:
+    """Return the outline of a relief, or the largest circle on the map where none is given, and say what that cuts off.
+
+    Args:
+        height_m: heights ``[y, x]``.
+        grid: their raster.
+        aperture: see `read_height`.
+        where: the map's name, for the message.
+    """
+    if aperture is not None:
+        return outline_on(grid, aperture)
+    found = aperture_from(min(grid.extent_m))
+    beyond = ~found.inside(grid)
+    if beyond.any() and np.ptp(height_m[beyond]):
+        said = (
+            "%s: no aperture was given, so %.2g %% of it, beyond a circle of %s, stay blank glass; give another if not"
+        )
+        log.warning(said, where, 100 * beyond.mean(), format_length(min(grid.extent_m)))
+    return found
 
 
 def outline_on(grid: Grid, aperture: Aperture | float | str) -> Aperture:

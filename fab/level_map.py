@@ -190,13 +190,14 @@ def read_level_map(path: str | Path) -> LevelMap:
         ny, nx = (int(n) for n in header["shape"])
         levels = Levels(int(header["levels"]), float(header["level_step_m"]), tuple(header["etch_depths_m"]))
         grid = Grid((ny, nx), float(header["pitch_m"]))
-        bits = np.unpackbits(arrays["planes"], axis=-1, count=nx)
-        if bits.shape != (levels.bits, ny, nx):
-            raise InputError(str(path), f"must hold {levels.bits} planes of {ny} x {nx}", bits.shape, cure)
+        packed = arrays["planes"]
+        if packed.shape != (levels.bits, ny, -(-nx // 8)):  # before memory is asked for by the header alone
+            raise InputError(str(path), f"must hold {levels.bits} planes of {ny} x {nx}", packed.shape, cure)
+        bits = np.unpackbits(packed, axis=-1, count=nx)
         level = level_map_from_planes(bits, levels)
         aperture = math.inf if header["aperture_m"] is None else header["aperture_m"]
         return LevelMap(level, levels, grid, aperture_from(aperture, where=f"{path}: aperture_m"), str(header["name"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(str(path), "must be a level map", f"{type(error).__name__}: {error}", cure) from error

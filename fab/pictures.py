@@ -60,7 +60,9 @@ def _require(fits: bool, path: Path, got: str, rule: str = "the file must hold o
         raise InputError(str(path), rule, got, _CURE)
 
 
-def require_size(path: Path, shape: Sequence[int], file_bytes: int, itemsize: int = 1) -> None:
+def require_size(
+    path: Path, shape: Sequence[int], file_bytes: int, itemsize: int = 1, most_px: int | None = None
+) -> None:
     """Refuse a picture of more pixels than memory should be given for, before it is decoded.
 
     Args:
@@ -68,20 +70,22 @@ def require_size(path: Path, shape: Sequence[int], file_bytes: int, itemsize: in
         shape: rows, columns and, if any, planes.
         file_bytes: size of the file.
         itemsize: bytes of a value.
+        most_px: pixels that any file may stand for, `MOST_PIXELS` by default; a large one for more.
     """
-    most = max(MOST_PIXELS, MOST_PER_BYTE * file_bytes)
+    most = max(most_px or MOST_PIXELS, MOST_PER_BYTE * file_bytes)
     fits = 0 < shape[0] * shape[1] <= most and prod(shape) * itemsize <= _BYTES_PER_PIXEL * most
     rule = f"a picture must have from 1 to {most} pixels, of {_BYTES_PER_PIXEL} bytes at the most"
     _require(fits, path, f"values of shape {tuple(shape)}, {itemsize} bytes each", rule)
 
 
-def read_pixels(path: str | Path, *, others: str | None = None) -> NDArray[Any]:
+def read_pixels(path: str | Path, *, others: str | None = None, most_px: int | None = None) -> NDArray[Any]:
     """Read the values of a PNG or TIFF, which its ending says it is, as they are; its orientation is left alone.
 
     Args:
         path: the file.
         others: mode of Pillow, such as "RGBA", into which pixels that are not plain counts (a palette, single bits) are
             converted; they are refused if None.
+        most_px: pixels that a small file may stand for, `MOST_PIXELS` by default.
 
     Returns:
         uint8, uint16 or what else a TIFF holds: `[y, x]`, or `[y, x, plane]` with 2 planes (grey and opacity), 3 or 4.
@@ -94,11 +98,11 @@ def read_pixels(path: str | Path, *, others: str | None = None) -> NDArray[Any]:
     with decoding(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries warn of what is refused, or does not matter
         if path.suffix.lower() in TIFF_FILES:
-            return _tiff_pixels(path, data, others)[::-1]
-        return _png_pixels(path, data, others)[::-1]
+            return _tiff_pixels(path, data, others, most_px)[::-1]
+        return _png_pixels(path, data, others, most_px)[::-1]
 
 
-def _tiff_pixels(path: Path, data: bytes, others: str | None) -> NDArray[Any]:
+def _tiff_pixels(path: Path, data: bytes, others: str | None, most_px: int | None) -> NDArray[Any]:
     import tifffile
 
     with tifffile.TiffFile(io.BytesIO(data)) as file:
@@ -107,7 +111,7 @@ def _tiff_pixels(path: Path, data: bytes, others: str | None) -> NDArray[Any]:
         _require(len(page.shape) in (2, 3), path, f"pixels of shape {page.shape}")
         separate = page.planarconfig == 2 and len(page.shape) == 3
         shape = (*page.shape[1:], page.shape[0]) if separate else page.shape
-        require_size(path, shape, len(data), page.dtype.itemsize)
+        require_size(path, shape, len(data), page.dtype.itemsize, most_px)
         kind = getattr(page.photometric, "name", str(page.photometric)).lower()
         plain = kind in ("minisblack", "rgb")
         _require(plain or others is not None, path, f"{kind} pixels of shape {page.shape}")
@@ -133,7 +137,7 @@ def _require_bounded(path: Path, page: Any, data: bytes) -> None:
             _require(found <= most, path, f"more than {most} bytes", "a strip must unfold to its size")
 
 
-def _png_pixels(path: Path, data: bytes, others: str | None) -> NDArray[Any]:
+def _png_pixels(path: Path, data: bytes, others: str | None, most_px: int | None) -> NDArray[Any]:
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
@@ -145,7 +149,8 @@ def _png_pixels(path: Path, data: bytes, others: str | None) -> NDArray[Any]:
         _require(plain or others is not None, path, f"pixels of the kind {image.mode}")
         deep = image.mode == "RGB" and any(tile.args == "RGB;16B" for tile in image.tile)
         planes = len(image.getbands())
-        require_size(path, (image.height, image.width, planes), len(data), 1 + (deep or planes == 1))
+        itemsize = 1 + (deep or planes == 1)
+        require_size(path, (image.height, image.width, planes), len(data), itemsize, most_px)
         values = np.asarray(image if plain else image.convert(others))
     if deep:
         # Pillow keeps the upper byte of a colour's two. Told that the lower one comes first, it keeps the other.

@@ -43,7 +43,10 @@ class Number(NamedTuple):
 
 @dataclass(frozen=True)
 class Stock:
-    """The usual numbers of one kind of process, errors by their name in `DEVIATIONS` (zero where missing)."""
+    """The usual numbers of one kind of process, errors by their name in `DEVIATIONS` (zero where missing).
+
+    `not_drawn` says what it takes in place of the plates of an order, which print a whole wafer by contact.
+    """
 
     name: str
     title: str
@@ -53,6 +56,7 @@ class Stock:
     wafer_radius_m: Figure
     defects: Mapping[str, Figure]
     tone: Literal["clear", "dark"] = "clear"
+    not_drawn: str = ""
 
     def numbers(self) -> Iterator[Number]:
         """Yield every number with its source, errors first, in the order of `DEVIATIONS`."""
@@ -169,6 +173,8 @@ _STEPPER_OVERLAY = estimate(
 _STEPPER = Stock(
     name="stepper",
     title="i-line wafer stepper, numerical aperture 0.5, reticles five times as large",
+    not_drawn="a stepper takes reticles with the DOE of one die, five times as large; these masks are plates for "
+    "contact printing, a whole wafer at 1:1: let the mask shop enlarge the cell of a die",
     errors=_errors(
         Typical(0.0, 50e-9, _STEPPER_OVERLAY),
         rotation_rad=Typical(0.0, 1e-6, estimate("the overlay at marks 70 mm apart: 50 nm * sqrt(2) / 70 mm")),
@@ -196,6 +202,7 @@ _WRITER_OVERLAY = estimate(
 _DIRECT_WRITE = Stock(
     name="direct_write",
     title="laser writer, every layer written onto the wafer without a plate",
+    not_drawn="a laser writer takes no masks but a file for each layer, which comes with an order for direct writing",
     errors=_errors(
         Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
         rotation_rad=Typical(0.0, 5e-6, estimate("the overlay at marks 70 mm apart: 0.25 um * sqrt(2) / 70 mm")),

@@ -37,6 +37,8 @@ from fab.units import metres
 
 log = logging.getLogger("doedesign")
 
+_RECIPE = "fused_silica"  # the material of the run sheet's wafer and etches
+
 
 def write_masks(
     source: Design | Run | str | Path,
@@ -64,7 +66,8 @@ def write_masks(
         probe_m: wavelength of the laser that the lab tests the DOE with, in metres or with a unit.
         patch: a window to write as a solid at full resolution, too.
         process: a process, the name of a stock process or a TOML file; that of the run, or an ideal one, by default.
-        wafer: the wafer to fill, or a TOML file with it; that of the run, or the usual one, by default.
+        wafer: the wafer to fill, or a TOML file with it; that of the run, or the usual one, by default. A file that
+            does not say how edges are moved leaves it to the run, whose masks may be drawn against its process.
         terms: what is asked of the mask shop besides the drawing, or a TOML file with it; that of the run, or else
             revision A and blanks, by default.
         direct_write: whether to write files for direct-write and greyscale exposure, too.
@@ -88,10 +91,15 @@ def write_masks(
     made_by = _process(process, level_map.levels, spec and spec.process)
     if not isinstance(wafer, Wafer):
         usual = spec.wafer if spec else WaferSpec()
-        wafer = wafer_from_spec(usual if wafer is None else load_wafer(wafer))
+        wafer = wafer_from_spec(usual if wafer is None else _wafer_of(load_wafer(wafer), usual))
     if not isinstance(terms, OrderTerms):
         asked = spec.order if spec else OrderSpec()
         terms = terms_from_spec(asked if terms is None else load_order(terms))
+    if spec is not None and spec.doe.material != _RECIPE:
+        said = (
+            "the run sheet's wafer and etches are those of fused silica, but the design is for %s: correct them there"
+        )
+        log.warning(said, spec.doe.material)
     order = plan_order(
         level_map,
         process=made_by,
@@ -149,6 +157,14 @@ def _process(given: Process | str | Path | None, levels: Levels, usual: ProcessS
         return made
     lithography = {key: getattr(made, key) for key in ("tone", "minimum_line_m", "minimum_space_m")}
     return Process(levels, name=made.name, **lithography)
+
+
+def _wafer_of(given: WaferSpec, usual: WaferSpec) -> WaferSpec:
+    """A wafer with edges moved as it says, or else as those of a run: pre-compensation is part of its masks."""
+    kept = ("edge_moves_m", "compensate")
+    if given.model_fields_set & {*kept}:
+        return given
+    return given.model_copy(update={name: getattr(usual, name) for name in kept})
 
 
 def _chrome(given: Process | str | Path | None, levels: Levels, usual: ProcessSpec | None) -> Chrome:

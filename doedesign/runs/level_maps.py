@@ -17,7 +17,7 @@ from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.grid import Grid
-from fab.height import HeightMap, outline_on, read_height
+from fab.height import HeightMap, outline_of, read_height
 from fab.layout.geometry import pixel_edges
 from fab.level_map import LevelMap, read_level_map, write_level_map
 from fab.levels import Levels
@@ -65,9 +65,8 @@ def read_any_height(
         raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Give the pitch of a pixel.")
     ny, nx = stored.height_m.shape
     grid = Grid((ny, nx), pitch_m)
-    if aperture is None:
-        aperture = stored.aperture or min(grid.extent_m)
-    return HeightMap(stored.height_m, grid, outline_on(grid, aperture))
+    outline = outline_of(stored.height_m, grid, aperture or stored.aperture, str(path))
+    return HeightMap(stored.height_m, grid, outline)
 
 
 def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:

@@ -72,6 +72,8 @@ class Wafer:
             raise InputError("wafer: blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
         if self.dies is not None and not all(isinstance(n, Integral) and n >= 1 for n in self.dies):
             raise InputError("wafer: dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
+        if self.dies is not None:
+            object.__setattr__(self, "dies", tuple(int(n) for n in self.dies))  # of numpy, they would not go into JSON
         if self.dies is not None and self.dies[0] * self.dies[1] > _MOST_DIES:
             rule = f"must be at most {_MOST_DIES} altogether"
             raise InputError("wafer: dies", rule, self.dies, "Let the wafer be filled.")

@@ -339,6 +339,9 @@ def read_manifest(folder: str | Path) -> Manifest:
         if [one.layer for one in layers] != [bit + 1 for bit in bits] or sorted(one.bit for one in layers) != [*bits]:
             rule = "every cell of the DOE must draw every plane once, bit 0 of the plate on layer 1"
             raise InputError(str(path), rule, cell, "Write the order again.")
+    if not 1e-6 <= manifest.dbu_nm <= 1e6:
+        rule, cure = "the database unit must lie from 1e-6 to 1e6 nm", "Write the order again."
+        raise InputError(str(path), rule, manifest.dbu_nm, cure)
     manifest.grid()
     manifest.staircase()
     for size in (manifest.aperture_mm, manifest.chrome.opening_diameter_mm):

@@ -25,7 +25,7 @@ from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair import Repair, repaired
 from fab.runsheet.tables import Predictions
 from fab.solids.patch import Patch
-from fab.stock import process_from
+from fab.stock import STOCK, process_from
 from fab.units import NM, UM, format_length
 
 if TYPE_CHECKING:
@@ -242,7 +242,7 @@ def plan_order(
     """
     made_by = process_from(process, level_map.levels)
     wafer, terms = wafer or Wafer(), terms or OrderTerms()
-    report = check(level_map, replace(Rules.from_process(made_by), address_m=terms.address_grid_m))
+    report = check(level_map, Rules.from_process(made_by, terms.address_grid_m))
     inside = level_map.level[level_map.relief.inside(level_map.grid)]
     if inside.size and inside.min() == inside.max():
         log.warning("every pixel of %s has level %d: it does to light what flat glass does", level_map.name, inside[0])
@@ -254,6 +254,8 @@ def plan_order(
     asked: dict[str, Any] = {"patch": patch, "terms": terms, "papers": papers, "direct_write": direct_write}
     asked["formats"] = formats or Formats()
     order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
+    if made_by.name in STOCK and (said := STOCK[made_by.name].not_drawn):
+        log.warning("process %s: %s", made_by.name, said)
     if narrowed := order.narrowed():
         if on_violation == "fail":
             cure = "Move edges less, or choose another process."

@@ -18,7 +18,7 @@ from fab.files import canonical_json
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.order.order import Order
-from fab.rules.check import check
+from fab.rules.check import Rules, check
 
 # The rules are those of the process, and a repaired level map needs no second repair.
 _ASKED = tuple(field.name for field in fields(Order) if field.name not in ("rules", "repair"))
@@ -64,9 +64,10 @@ def order_from(request: Mapping[str, Any], level: NDArray[np.uint8], where: str)
         raise InputError(f"{where}: request", found["msg"], repr(found["input"])[:60], _CURE) from errors
     except InputError as error:
         raise InputError(f"{where}: request: {error.where}", error.rule, error.got, _CURE) from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: request", "must be whole", f"{type(error).__name__}: {error}", _CURE) from error
-    order = Order(check(level_map, asked["process"]), **asked)
+    rules = Rules.from_process(asked["process"], asked["terms"].address_grid_m)
+    order = Order(check(level_map, rules), **asked)
     if canonical_json(request_of(order)) != canonical_json(request):
         raise InputError(f"{where}: request", "must hold the keys and values of an order", "others", _CURE)
     return order

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass, fields
+from numbers import Integral
 
 from fab.errors import InputError
 from fab.units import format_length
@@ -68,8 +69,10 @@ class OrderTerms:
         if not _REVISION.fullmatch(self.revision):
             rule = "must be one to three capitals A-Z or digits"
             raise InputError("order: revision", rule, repr(self.revision), 'For example "A" or "02".')
-        if self.quantity is not None and self.quantity < 1:
-            raise InputError("order: quantity", "must be 1 or more", self.quantity, "Leave it out if it is open.")
+        if self.quantity is not None and not (isinstance(self.quantity, Integral) and self.quantity >= 1):
+            raise InputError(
+                "order: quantity", "must be a whole number, 1 or more", self.quantity, "Leave it out if it is open."
+            )
         if self.defects_per_cm2 is not None and not 0 <= self.defects_per_cm2 < 1e6:
             got = self.defects_per_cm2
             raise InputError("order: defects_per_cm2", "must be 0 or more, below a million", got, "Check it.")

@@ -80,9 +80,9 @@ class Rules:
                 raise InputError(f"rules: {name}", "must be positive and finite", value, cure)
 
     @classmethod
-    def from_process(cls, process: Process) -> "Rules":
-        """Return the rules of a process: the narrowest line and space that it prints."""
-        return cls(process.minimum_line_m, process.minimum_space_m)
+    def from_process(cls, process: Process, address_m: float | None = None) -> "Rules":
+        """Return the rules of a process, the narrowest line and space that it prints, and of a mask writer's grid."""
+        return cls(process.minimum_line_m, process.minimum_space_m, address_m)
 
     def codes(self, plane: NDArray[np.uint8], pitch_m: float) -> NDArray[np.uint8]:
         """Say of every pixel of a mask if it is space (0), line (1), or in a narrow space (2) or line (3); `[y, x]`."""

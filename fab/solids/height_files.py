@@ -274,10 +274,11 @@ def _kind(
     )
 
 
+_read_large = partial(read_pixels, most_px=1 << 28)  # a regular DOE of a level map's size packs well
 _FLOOR, _BLANK = "height above the deepest floor", "white is the blank surface"
 _TOP_ROW = "first row at the highest y"
 KINDS = (
-    _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", _exact_scale, write_tiff, read_pixels),
+    _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", _exact_scale, write_tiff, _read_large),
     _kind(
         "_HEIGHT.npy",
         f"{_FLOOR}, row 0 at the lowest y",
@@ -285,6 +286,6 @@ KINDS = (
         write_npy,
         read_npy,
     ),
-    _kind("_GREY.png", f"{_BLANK}, {_TOP_ROW}", partial(_full_scale, top=65535), write_greymap, read_pixels),
+    _kind("_GREY.png", f"{_BLANK}, {_TOP_ROW}", partial(_full_scale, top=65535), write_greymap, _read_large),
     ModelKind("_SAG.DAT", _sag_entry, _write_sag, _sag_problems),
 )

@@ -78,6 +78,7 @@ def test_what_was_said_stands_in_every_row():
         ({"contact": "two\nlines"}, "contact"),
         ({"remarks": "x" * 201}, "remarks"),
         ({"quantity": 0}, "quantity"),
+        ({"quantity": "3"}, "quantity"),
         ({"cd_tolerance_m": -1e-9}, "cd_tolerance_m"),
         ({"blank_thickness_m": 2.3}, "blank_thickness_m"),
         ({"defects_per_cm2": float("nan")}, "defects_per_cm2"),

@@ -1,8 +1,11 @@
+import json
+
 import numpy as np
 import pytest
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.layout.wafer import Wafer
 
 
 def test_the_centre_lies_between_samples_for_even_counts_and_on_one_for_odd():
@@ -10,6 +13,13 @@ def test_the_centre_lies_between_samples_for_even_counts_and_on_one_for_odd():
     assert grid.axis_m("y").tolist() == [-2.0, 0.0, 2.0]
     assert grid.axis_m("x").tolist() == [-3.0, -1.0, 1.0, 3.0]
     assert grid.extent_m == (6.0, 8.0)
+
+
+def test_numbers_of_numpy_are_those_of_python():
+    """An order writes them as JSON."""
+    grid = Grid((np.int64(3), np.int32(4)), np.float32(2.0))  # pyright: ignore[reportArgumentType]
+    assert json.dumps([grid.shape, grid.pitch_m]) == "[[3, 4], 2.0]"
+    assert json.dumps(Wafer(dies=(np.int64(1), np.int64(2))).dies) == "[1, 2]"  # pyright: ignore[reportArgumentType]
 
 
 def test_a_circle_takes_the_pixels_whose_centre_is_inside_or_on_it():

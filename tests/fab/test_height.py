@@ -121,6 +121,18 @@ def test_pitch_and_scale_are_asked_for(tmp_path):
         read_height(tmp_path / "h.npy", -UM)
 
 
+def test_what_the_usual_aperture_cuts_off_is_said(tmp_path, caplog):
+    np.save(tmp_path / "h.npy", HEIGHTS)
+    read_height(tmp_path / "h.npy", pitch=UM)
+    assert "no aperture was given, so 33 % of it, beyond a circle of 3 um, stay blank glass" in caplog.text
+    caplog.clear()
+    read_height(tmp_path / "h.npy", pitch=UM, aperture="3 um")
+    rim = np.where(Grid((3, 4), UM).inside_circle(3 * UM), HEIGHTS, 0.0)
+    np.save(tmp_path / "h.npy", rim)
+    read_height(tmp_path / "h.npy", pitch=UM)
+    assert not caplog.text
+
+
 def test_a_height_map_belongs_to_its_grid():
     with pytest.raises(InputError, match="grid's shape"):
         HeightMap(HEIGHTS, Grid((4, 3), UM), UM)

@@ -83,6 +83,8 @@ def test_uneven_depths_and_equal_bytes(tmp_path):
         ({"format": "another"}, "format"),
         ({"shape": [3]}, "level map"),
         ({"shape": [30, 44]}, "planes"),
+        ({"shape": [30, 10**14]}, "planes"),
+        ({"pitch_m": 10**400}, "level map"),
         ({"levels": 65}, "whole number from 2 to 64"),
         ({"levels": 12}, "one of the 12 levels"),
         ({"pitch_m": -1.0}, "pitch"),

@@ -80,6 +80,7 @@ def test_large_pictures_are_refused_before_they_are_decoded(tmp_path: Path, monk
         write_pixels(tmp_path / name, np.zeros((100, 300), np.uint8), about="packed")
         with pytest.raises(InputError, match=rf"{name}: a picture must have from 1 to \d+ pixels"):
             read_pixels(tmp_path / name)
+        assert read_pixels(tmp_path / name, most_px=30_000).shape == (100, 300)
 
 
 def test_palettes_are_looked_up_on_request(tmp_path: Path):

@@ -1,10 +1,14 @@
 import math
 
+import numpy as np
 import pytest
 
+from fab.grid import Grid
 from fab.levels import Levels
+from fab.order.order import plan_order
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from fab.stock import IDEAL, STOCK, Stock
+from tests.fab.maps import wide_map
 
 
 @pytest.mark.parametrize("stock", STOCK.values(), ids=STOCK)
@@ -101,3 +105,11 @@ def test_numbers_are_those_of_a_cleanroom(stock: Stock):
         assert low <= typical.mean <= high, key
         most = USUAL["sigma"].get(key, 5e-6 if key.endswith("_m") else 0.1)
         assert 0 <= typical.sigma <= most, key
+
+
+@pytest.mark.parametrize("name", sorted(STOCK))
+def test_an_order_for_a_process_without_contact_masks_says_so(name, caplog):
+    plate = wide_map(np.zeros((8, 8), np.uint8), Levels(4, 300e-9), Grid((8, 8), 2e-6), "s")
+    plan_order(plate, process=name)
+    told = [message for message in caplog.messages if message.startswith(f"process {name}: ")]
+    assert len(told) == (name in ("stepper", "direct_write"))
