@@ -90,6 +90,10 @@ class Sample:
             if has[i] and colour in (None, name) and (depth_m is None or math.isclose(depth, depth_m, rel_tol=1e-6))
         ]
 
+    def colours_of(self, quantity: str) -> tuple[str, ...]:
+        """Colours that have this quantity: what is aimed at has it in its own alone."""
+        return tuple(dict.fromkeys(self.places[row][0] for row in self.rows_of(quantity)))
+
     def worst(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> Float[np.ndarray, " d"]:
         """The worst value of every draw over the rows of a colour and depth, or over all of them."""
         chosen = self.values[quantity][:, self.rows_of(quantity, colour, depth_m)]

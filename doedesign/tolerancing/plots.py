@@ -89,8 +89,9 @@ def plot_histograms(sample: Sample, nominal: Sample, camera: "Camera", ax: "Axes
     with _per_quantity(ax, list(sample.values), words, "Plates as fabricated", _colour_keys(camera)) as (figure, grid):
         for axes, quantity in zip(grid, sample.values, strict=True):
             scale = _scale(quantity)
-            series = {c: scale * _finite(sample.worst(quantity, c)) for c in sample.colours}
-            design = {c: scale * float(nominal.worst(quantity, c)[0]) for c in sample.colours}
+            colours = sample.colours_of(quantity)
+            series = {c: scale * _finite(sample.worst(quantity, c)) for c in colours}
+            design = {c: scale * float(nominal.worst(quantity, c)[0]) for c in colours}
             bins = _bins(np.concatenate([*series.values(), _finite(np.array(list(design.values())))]), plates)
             for colour, values in series.items():
                 axes.hist(values, bins, histtype="stepfilled", color=hues[colour], alpha=0.15)

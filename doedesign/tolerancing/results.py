@@ -201,7 +201,7 @@ def tolerance(
     if sensitivity == "sobol":
         keys += asked.sobol_keys(sobol)
     if corners:
-        keys += corner_keys(asked.process)
+        keys += asked.corner_keys()
     if budget is not None:
         keys += [key for some in asked.budget_keys(budget, wanted, draws) for key in some]
     keys = list(dict.fromkeys(keys))

@@ -42,7 +42,7 @@ def one_at_a_time(process: Process, sample: Sample) -> list[Effect]:
     keys = set(one_at_a_time_keys(process))
     out = []
     for quantity in sample.values:
-        for colour in (None, *sample.colours):
+        for colour in (None, *sample.colours_of(quantity)):
             values = dict(zip(sample.keys, sample.worst(quantity, colour).tolist(), strict=True))
             expected = values[EXPECTED]
             for name in varying(process):
@@ -103,7 +103,7 @@ def sobol(process: Process, sample: Sample, count: int, seed: int = 0) -> list[V
 
     sources = sources_of(process)
     of = sample.of(sobol_keys(process, count))
-    numbers = {(q, c): _clipped(of.worst(q, c)) for q in of.values for c in (None, *of.colours)}
+    numbers = {(q, c): _clipped(of.worst(q, c)) for q in of.values for c in (None, *of.colours_of(q))}
     outputs = [output for output, found in numbers.items() if _varies(found)]
     if not outputs:
         return []

@@ -133,16 +133,20 @@ class Study:
         """DOEs as the process makes them, rare events included."""
         return self.sample(normal_keys(_at_least_one("draws", draws)))
 
+    def corner_keys(self) -> list[str]:
+        """Keys of `corners`; an InputError where nothing but rare events varies."""
+        keys = corner_keys(self.process)
+        if not keys:
+            raise InputError("corners", "must have errors with a sigma", "rare events only", "Leave them out.")
+        return keys
+
     def corners(self) -> Sample:
         """DOEs with every error two standard deviations to one side or the other.
 
         Raises:
             InputError: nothing but rare events varies.
         """
-        keys = corner_keys(self.process)
-        if not keys:
-            raise InputError("corners", "must have errors with a sigma", "rare events only", "Leave them out.")
-        return self.sample(keys)
+        return self.sample(self.corner_keys())
 
     def one_at_a_time(self) -> list[Effect]:
         """Effect of every error alone, one standard deviation to either side."""
@@ -242,6 +246,8 @@ def study(
         raise InputError("process", rule, "none with a sigma above zero", cure)
     if seed < 0:
         raise InputError("seed", "must not be negative", seed, "For example 0.")
+    if not hasattr(evaluate, "__qualname__"):  # by which its draws are known
+        raise InputError("evaluate", "must be a function", type(evaluate).__name__, "Write one with def.")
     if out is not None and "<" in evaluate.__qualname__:
         rule = "must be a function at the top of a module, for a study on disk is known by its name"
         raise InputError("evaluate", rule, evaluate.__qualname__, "Move it there.")

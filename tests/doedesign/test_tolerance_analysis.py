@@ -403,6 +403,7 @@ def test_a_budget_that_no_error_size_decides(fakes):
         ({"limits": ["strehl >= 0.9"]}, lambda asked: asked.budget("overlay", 0.9, 9, (0.5, 1)), "must grow from 0"),
         ({"limits": ["strehl >= 0.9"]}, lambda asked: asked.budget("rotation"), "must name errors that vary"),
         ({}, lambda asked: asked.monte_carlo(0), "draws: must be at least 1"),
+        ({"evaluate": functools.partial(print)}, lambda asked: asked, "evaluate: must be a function"),
         ({"seed": -1}, lambda asked: asked, "must not be negative"),
         ({"workers": 0}, lambda asked: asked, "workers: must be at least 1"),
         ({"workers": 2, "scheduler": "tcp://x"}, lambda asked: asked, "brings its own workers"),

@@ -53,6 +53,22 @@ def test_numbers_of_what_light_should_make_have_a_yield(tmp_path: Path, text: st
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("sensitivity", ["one_at_a_time", "sobol"])
+def test_what_is_aimed_at_has_its_numbers_in_its_own_colour_alone(tmp_path: Path, sensitivity: Any):
+    """A second colour has those of light in general."""
+    two = 'optics.wavelengths=["532 nm", "450 nm"]'
+    design = designed(tmp_path, SPOTS, two)
+    errors = {name: 0.0 for name in ("overlay_x_m", "overlay_y_m", "rotation_rad", "magnification", "sidewall_rad")}
+    found = dd.tolerance(design, process=PROCESS, errors=errors, draws=2, sensitivity=sensitivity, sobol=2)
+    first, other = found.sample.colours
+    assert found.sample.colours_of("uniformity_error") == (first,)
+    assert found.sample.colours_of("zeroth_order") == (first, other)
+    for row in found.effects or found.variance_shares or ():
+        assert row.colour in (None, first) or row.quantity not in ("on_target", "uniformity_error")
+    found.plot()
+
+
+@pytest.mark.slow
 def test_workers_and_a_study_on_disk_know_them_too(tmp_path: Path):
     design = designed(tmp_path, SPOTS)
     asked: dict[str, Any] = {"process": PROCESS, "limits": ["uniformity_error <= 90 %"], "out": tmp_path / "out"}
