@@ -87,17 +87,20 @@ def optimize(
         spec: the spec, or its TOML file.
         out: run folder, in which a stopped optimisation goes on where it was stopped and to which results and pictures
             are written; without one everything stays in memory.
-        overrides: changes to the spec, "table.key=value".
+        overrides: changes to the spec, "table.key=value"; of one that was read, only if it is as its file has it.
         objectives: objectives of your own, by the names "module:function" that the spec gives them
             (`doedesign.import_objectives` imports them). A run records the files they are in.
         overwrite: where the folder has the run of another spec, remove it with all that was made of it.
 
     Returns:
-        the design: its level map, the heights before rounding (metres), and the history of its loss.
+        the design: its level map, the heights before rounding (metres), and, without `out`, the history of its loss.
 
     Raises:
         InputError: a mistake in the spec or its inputs, or a folder that belongs to something else.
     """
+    if isinstance(spec, Spec) and overrides and (spec.file is None or load_spec(spec.file) != spec):
+        rule, cure = "change a spec as its file has it", "Make all changes where it is read, by load_spec."
+        raise InputError("overrides", rule, "one that was changed before", cure)
     if not isinstance(spec, Spec) or overrides:
         spec = load_spec(spec.file or "" if isinstance(spec, Spec) else spec, overrides)
     for warning in spec_warnings(spec):

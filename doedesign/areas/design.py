@@ -96,13 +96,14 @@ class AreaTask:
     def initial_state(self) -> AreaState:
         """The phase that carries the beam to the areas as rays would, or a random one.
 
-        Where there are several, every cell has the phase whose light comes nearest to what all of them ask for.
+        Where there are several, or one in another colour than the first, every cell has the phase, of the first colour
+        and within a wave of the relief, whose light comes nearest to what all of them ask for.
         """
         grid = self.camera.grid
         if self._random:
             rng = np.random.default_rng(self.spec.optimize.seed)
             phase = rng.uniform(0, self.problem.span or 2 * np.pi, grid.shape)
-        elif len(self.targets) == 1:
+        elif len(self.targets) == 1 and self.problem.span is None:
             phase = self._carrying(0)
         else:
             asked = [self._carrying(i) for i in range(len(self.targets))]

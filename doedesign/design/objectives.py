@@ -118,7 +118,7 @@ class Term(NamedTuple):
     @property
     def target(self) -> Float[np.ndarray, "y x"] | None:
         """Target image of a `target_pattern`: energy per pixel, summing to 1."""
-        return self.function.keywords.get("target")
+        return self.function.keywords["target"] if self.name == "target_pattern" else None
 
 
 def disc_radii_m(camera: Camera, near_m: Sequence[float]) -> Float[np.ndarray, " n"]:
@@ -204,8 +204,8 @@ def window_share(psfs: PsfSet, *, least: float) -> Array:
 def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
     """The paper's hand-crafted variant (§4): far PSF towards a point, near PSF towards an even window.
 
-    Squared distances, each relative to its target's: |p_far - delta|² where delta is all light in the far spot,
-    and |p_near - u|² / |u|² where u spreads all light evenly over the window.
+    Squared distances, each relative to its target's: |p_far - delta|² / |delta|² where delta is all light in the far
+    spot, and log(1 + |p_near - u|² / |u|²) where u spreads all light evenly over the window.
     """
     if not isinstance(near_weight, int | float):
         raise InputError("handcrafted: near_weight", "must be a number", repr(near_weight), "For example 1.0.")

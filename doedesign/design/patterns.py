@@ -133,19 +133,25 @@ def picture_light(path: Path) -> Image:
 
 
 def _picture(camera: Camera, path: Path) -> Image:
-    """A picture's light, resized to the window."""
+    """A picture's light, its longer side as long as the window's, dark beside it."""
     from skimage.transform import resize
 
-    return np.asarray(resize(picture_light(path), (camera.window, camera.window), anti_aliasing=True))
+    light = picture_light(path)
+    shape = [max(1, round(camera.window * side / max(light.shape))) for side in light.shape]
+    room = [camera.window - side for side in shape]
+    return np.pad(resize(light, shape, anti_aliasing=True), [(side // 2, side - side // 2) for side in room])
 
 
 def target_image(camera: Camera, options: dict[str, Any], picture: Path | None, where: str) -> Image:
     """Target energies per pixel of the sensor window, summing to 1, float32: a picture, or a pattern of the options.
 
+    A picture is as long as the window and keeps its proportions.
     `pattern` is "spots" (count, spacing), "square" (width) or "disc" (diameter), each with an `offset` [x, y] on the
     sensor; `where` is the key of the objective, for messages.
     """
     if picture is not None:
+        if unknown := sorted(options.keys() - {"image"}):
+            raise InputError(where, "an image has no other options", unknown[0], "Remove it.")
         target = _picture(camera, picture)
     else:
         name = options.get("pattern")

@@ -315,9 +315,18 @@ def _printing(spec: Spec) -> Iterator[InputError]:
 
 
 def _objectives(spec: Spec) -> Iterator[InputError]:
-    if not (spec.objectives or spec.aims) and spec.optimize.steps > 0:
-        rule = "an optimisation must have something to improve"
-        yield InputError("objective", rule, "no [[objective]]", "Add one, or steps = 0.")
+    if not (spec.objectives or spec.aims):
+        own = spec.optimize
+        focused = own.start == "fresnel" and "focal_length" not in dict(own.start_options)
+        for judged, got, cure in (
+            (own.steps > 0, "no [[objective]]", "Add one, or steps = 0."),
+            (own.polish > 0, "no [[objective]] for polish", "Add one, or leave polish out."),
+            (own.start == "nlopt", 'no [[objective]] for start = "nlopt"', "Add one, or choose another start."),
+            (focused, "no [[objective]] for the best focal length", "Add one, or start_options.focal_length."),
+        ):
+            if judged:
+                yield InputError("objective", "an optimisation must have something to improve", got, cure)
+                break
     for index, objective in enumerate(spec.objectives):
         if objective.name in NEAR_OBJECTIVES and not spec.scene.near_m:
             rule = f'"{objective.name}" looks at near depths, so scene.near must hold one'

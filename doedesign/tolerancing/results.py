@@ -16,7 +16,7 @@ from doedesign.tolerancing.pool import Evaluate, predicted_rows
 from doedesign.tolerancing.result_files import write_results
 from doedesign.tolerancing.sensitivity import Effect, VarianceShare, source_shares
 from doedesign.tolerancing.studies import FORMAT, Study, study
-from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys
+from fab.draws import EXPECTED, NOMINAL, normal_keys, one_at_a_time_keys
 from fab.errors import InputError
 from fab.figure import html_of
 from fab.process import DEVIATIONS, Process, short_name

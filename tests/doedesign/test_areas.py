@@ -425,6 +425,17 @@ TWO_COLOURS = ("optics.wavelengths=['638 nm', '450 nm']", "process.levels=32", "
 
 
 @pytest.mark.slow
+def test_one_area_in_another_colour_than_the_first_begins_with_its_light(tmp_path: Path):
+    """Nearly as well as alone: the relief wraps at waves of the first colour."""
+    found = []
+    for words in (TWO_COLOURS, ("optics.wavelengths=['450 nm']",)):
+        task = AreaTask.from_spec(several(tmp_path, [f'{LEFT}\ncolour = "450nm"'], *words))
+        found.append(task.problem.judge(task.initial_state().phase)[0])
+    (mixed, alone) = found
+    assert mixed.efficiency > 0.85 * alone.efficiency
+    assert mixed.contrast < alone.contrast + 0.3
+
+
 def test_every_colour_lights_an_area_of_its_own(tmp_path: Path):
     """A relief of two to three waves sends red to the left and blue to the right: by PSFs, and by tables."""
     spec = several(tmp_path, [f'{LEFT}\ncolour = "638nm"', f'{RIGHT}\ncolour = "450nm"'], *TWO_COLOURS)

@@ -13,7 +13,7 @@ import pytest
 from scipy import special
 
 from doedesign.build import camera_from_spec
-from doedesign.design.metrics import drawn_patterns
+from doedesign.design.metrics import _spot_energies, drawn_patterns
 from doedesign.design.objectives import (
     BUILT_IN,
     PsfSet,
@@ -255,6 +255,25 @@ def test_a_length_that_is_none(width: str) -> None:
     assert "objective[0] target_pattern: width: must be" in str(caught.value)
 
 
+def test_a_picture_keeps_its_proportions(tmp_path: Path) -> None:
+    """Four times as wide as tall: dark above and below; a square in it stays one."""
+    wide = np.zeros((16, 64), np.uint8)
+    wide[4:12, 28:36] = 255
+    write_pixels(tmp_path / "wide.png", wide)
+    found = target_image(CAMERA, {"image": "wide.png"}, tmp_path / "wide.png", "objective")
+    rows, columns = (np.flatnonzero(found.sum(axis) > 1e-6) for axis in (1, 0))
+    assert rows.tolist() == columns.tolist() == [*range(28, 36)]
+    with pytest.raises(InputError, match="an image has no other options, but got width"):
+        target_image(CAMERA, {"image": "wide.png", "width": "1 mm"}, tmp_path / "wide.png", "objective")
+
+
+def test_light_between_two_spots_counts_once() -> None:
+    """Of a pattern whose discs overlap: all light is on target, once."""
+    options = {"pattern": "spots", "count": (3, 3), "spacing": "12 um"}
+    light = target_image(CAMERA, options, None, "objective")
+    assert 0.9 < _spot_energies(CAMERA, light, options).sum() < 1.0001
+
+
 def test_pictures_of_other_kinds_hold_the_same_light(tmp_path: Path) -> None:
     """Alpha is left out, grey with one channel is grey, and colours count by their luminance."""
     grey = np.zeros((64, 64), np.uint8)
@@ -447,6 +466,12 @@ def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
         terms_from_spec(spec, CAMERA, {})
     term = terms_from_spec(spec, CAMERA, {}, import_objectives(spec))[0]
     assert float(term.value(view(even(), point()))) == pytest.approx(1 / 64**4, rel=1e-5)
+    # An option of that name is no picture.
+    module.near_to = lambda view, *, target: jnp.mean(view.near) - target  # type: ignore[attr-defined]
+    spec = load_spec(
+        EXAMPLES / "quick.toml", ["objective.0={ name = 'users_objectives:near_to', options.target = 0.3 }"]
+    )
+    assert terms_from_spec(spec, CAMERA, {}, import_objectives(spec))[0].target is None
 
 
 @pytest.mark.parametrize(

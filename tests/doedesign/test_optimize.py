@@ -264,3 +264,22 @@ def test_a_descent_on_levels_lowers_the_loss_and_repeats() -> None:
 def test_rounding_that_cannot_be_is_told(change: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
         load_spec(EXAMPLES / "quick.toml", change)
+
+
+def test_overrides_go_with_a_spec_as_its_file_has_it() -> None:
+    """They are put into the file's text, so that changes to the values would be lost without a word."""
+    spec = load_spec(EXAMPLES / "quick.toml", steps=7)
+    with pytest.raises(InputError, match="overrides: change a spec as its file has it, but got one that was changed"):
+        optimization.optimize(spec, overrides=["process.levels=8"])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [["optimize.polish=2"], ['optimize.start="nlopt"'], ['optimize.start="fresnel"', "optimize.start_options={}"]],
+)
+def test_what_a_loss_decides_needs_an_objective(changes: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "bare.toml"
+    path.write_text((EXAMPLES / "quick.toml").read_text().partition("[[objective]]")[0].partition("[optimize]")[0])
+    with pytest.raises(InputError, match="objective: an optimisation must have something to improve"):
+        load_spec(path, ["optimize.steps=0", *changes])
+    load_spec(path, ["optimize.steps=0"])
