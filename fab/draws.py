@@ -207,9 +207,15 @@ def sobol_keys(process: Process, count: int) -> list[str]:
 
 
 def budget_keys(what: str, factors: Iterable[float], count: int) -> list[str]:
-    """Keys of `count` draws with the deviations of some errors scaled by each factor; at 1, the plain draws."""
+    """Keys of `count` draws with the deviations of some errors scaled by each factor; at 1, the plain draws.
+
+    Of rare events not even then: those of other factors have their events, or some of them.
+    """
+    plain = what != DEFECTS
     return [
-        f"normal/{i}" if factor == 1 else f"budget/{what}/{factor:g}/{i}" for factor in factors for i in range(count)
+        f"normal/{i}" if plain and factor == 1 else f"budget/{what}/{factor:g}/{i}"
+        for factor in factors
+        for i in range(count)
     ]
 
 
@@ -277,19 +283,42 @@ def _scaled_draw(process: Process, seed: int, plate_m: float, what: str, factor:
     if not 0 <= factor < np.inf:
         raise ValueError(factor)
     chosen = chosen_errors(process, what)
+    drawn, scores = normal_draw(process, seed, index, plate_m), normal_scores(process, seed, index)
     if what == DEFECTS:
-        defects = process.defects
-        scaled = replace(
-            defects,
-            particles_per_m2=factor * defects.particles_per_m2,
-            pinholes_per_m2=factor * defects.pinholes_per_m2,
-            missed=min(factor * defects.missed, 1.0),
-            doubled=min(factor * defects.doubled, 1.0),
-        )
-        return normal_draw(replace(process, defects=scaled), seed, index, plate_m)
+        return draw_at(process, scores, drawn.seed, **_scaled_events(process, [seed, index, 4], plate_m, factor))
     factors = np.array([factor if name in chosen else 1.0 for name in varying(process)])
-    events = normal_draw(process, seed, index, plate_m)
-    return _with_scores(process, factors * normal_scores(process, seed, index), events)
+    return _with_scores(process, factors * scores, drawn)
+
+
+def _scaled_events(process: Process, seed: Sequence[int], side_m: float, factor: float) -> dict[str, object]:
+    """Rare events `factor` times as frequent; a smaller factor has some of those of a larger one, and no others."""
+    from scipy.stats import poisson
+
+    defects, mean = process.defects, factor * side_m**2
+    rng = np.random.default_rng([*seed, process.masks])
+    chances, counts = rng.random(process.masks), rng.random(process.masks + 1)
+    missed, doubled = (min(factor * chance, 1.0) for chance in (defects.missed, defects.doubled))
+    repeats = np.where(chances < missed, -1, np.where(chances > 1 - doubled, 1, 0))
+
+    def discs(place: int, per_m2: float, radius_m: float) -> list[Disc]:
+        """As many as the same share of all plates has at most; the first of a stream of their own."""
+        own = np.random.default_rng([*seed, place])
+        made = (
+            (own.random(2), own.exponential(radius_m)) for _ in range(int(poisson.ppf(counts[place], per_m2 * mean)))
+        )
+        return [Disc(float((y - 0.5) * side_m), float((x - 0.5) * side_m), float(radius)) for (y, x), radius in made]
+
+    particles = [
+        MaskDisc(mask, *disc)
+        for mask in range(process.masks)
+        for disc in discs(mask, defects.particles_per_m2, defects.particle_radius_m)
+    ]
+    pinholes = discs(process.masks, defects.pinholes_per_m2, defects.pinhole_radius_m)
+    return {
+        "repeats": tuple(int(n) for n in repeats) if repeats.any() else (),
+        "particles": tuple(particles),
+        "pinholes": tuple(pinholes),
+    }
 
 
 def _with_scores(process: Process, scores: Sequence[float] | NDArray[np.floating], events: Variation) -> Variation:

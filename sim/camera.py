@@ -16,8 +16,8 @@ from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.units import DEGREES, PlaceUnit, format_length
-from sim.illumination import Beam, beam_amplitude, beam_irradiance
-from sim.lens import IDEAL, Distortion, Mapping, check_lens, direction_sines, image_place, sines_at
+from sim.illumination import Beam, EvenBeam, beam_amplitude, beam_irradiance
+from sim.lens import IDEAL, Distortion, Mapping, check_lens, direction_sines, distorted_place, image_place, sines_at
 from sim.material import fresnel_transmission, refractive_index
 
 _PARAXIAL = 0.02  # wave
@@ -36,11 +36,19 @@ class Colour:
         name: name of the channel.
         wavelengths_m: vacuum wavelengths, metres.
         weights: their weights, which sum to 1.
+
+    Raises:
+        InputError: another number of weights than of wavelengths, or weights that do not sum to 1.
     """
 
     name: str
     wavelengths_m: tuple[float, ...]
     weights: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.wavelengths_m) != len(self.weights) or abs(sum(self.weights) - 1) > 1e-6:
+            rule, got = "must be one for each wavelength, together 1", f"{self.weights} for {len(self.wavelengths_m)}"
+            raise InputError(f"colour {self.name}: weights", rule, got, "Divide them by their sum.")
 
 
 class SpectralLine(NamedTuple):
@@ -109,6 +117,8 @@ class Camera:
     def __post_init__(self) -> None:
         """Refuse a lens that cannot image the window, and words that mean nothing here."""
         object.__setattr__(self, "aperture", aperture_from(self.aperture))
+        if not 0 < self.fill <= 1:
+            raise InputError("fill", "must lie above 0, up to 1", self.fill, "Give the side of a pixel over its pitch.")
         if math.isinf(self.focal_length_m) != (self.distance_m is not None):
             got = f"a focal length of {self.focal_length_m:g} m and a distance of {self.distance_m} m"
             rule, cure = "a camera has a lens, or a sensor at a distance", "Give a distance without a lens only."
@@ -257,6 +267,21 @@ class Camera:
         reach = self.opening.reach_m + self.window * self.pixel_m / math.sqrt(2)
         follows = max(self.grid.shape) * self.grid.pitch_m**2 / shortest
         return max(follows, (reach**4 / (8 * shortest * _PARAXIAL)) ** (1 / 3))
+
+    def require_image(self, field_rad: tuple[float, float]) -> None:
+        """Raise an `InputError` for a field angle at which a distorted image folds over within the window.
+
+        Or for one beside a beam from a point, whose wavefront has the beam's own angle alone.
+        """
+        if isinstance(self.beam, EvenBeam) and math.isfinite(self.beam.distance_m) and any(field_rad):
+            rule, cure = "a beam from a point has an angle of its own", "Give the beam that angle."
+            raise InputError("field_rad", rule, f"{field_rad} besides", cure)
+        chief_rad = self.chief_rad(field_rad)
+        if self.distance_m is not None or self.is_sine or not any(chief_rad):
+            return
+        chief = distorted_place(self.mapping, self.distortion, float(np.hypot(*direction_sines(chief_rad))))
+        corner = self.window * self.pixel_m / 2**0.5 / self.sensor_distance_m
+        check_lens(self.mapping, self.distortion, chief + corner)
 
     def require_upright(self, field_rad: tuple[float, float]) -> None:
         """Raise an `InputError` for a chief ray so aslant that a sensor without a lens sees another image than on axis.

@@ -66,16 +66,17 @@ def read_frame(
 
 
 def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> CameraFrame:
-    from sim.store import read_bank
+    from sim.store import is_own_bank, read_bank
 
-    # Of a foreign file only the values are wanted; its pitch is whatever was given.
-    bank = read_bank(path, pixel_m or 1.0)
+    # Of a foreign file only the values are wanted; its pitch is whatever was given. One of our own knows its own.
+    bank = read_bank(path, pixel_m if pixel_m is not None or is_own_bank(path) else 1.0)
     if len(bank.depths_m) > 1:
         rule = "a measured PSF must hold one depth"
         raise InputError(str(path), rule, f"a bank of {len(bank.depths_m)}", "Give one file per depth.")
     counts = bank.energy[:, 0]
     if len(counts) > 1:
-        if bank.colours != ("R", "G", "B"):
+        first = [name[:1].lower() for name in bank.colours]
+        if first != ["r", "g", "b"]:
             got = f"the colours {', '.join(bank.colours)}"
             raise InputError(str(path), "a measured PSF must have one colour, or red, green, blue", got, "Keep one.")
         counts = counts[[_CHANNELS.index(_named(path, channel))]]

@@ -14,6 +14,7 @@ Powers count from the whole beam: what misses the opening of the chrome is lost.
 import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -49,6 +50,8 @@ class GaussianBeam:
     tilt_rad: Pair = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if not (np.shape(self.radius_m) == (2,) and all(0 < radius < np.inf for radius in self.radius_m)):
+            raise ValueError(f"`radius_m` must be two positive lengths (y, x), but got {self.radius_m}")
         if not all(1 <= quality < np.inf for quality in self.m_squared):
             raise ValueError(f"`m_squared` must be at least 1 and finite, but got {self.m_squared}")
 
@@ -73,32 +76,53 @@ class GaussianBeam:
         """Power of every mode; the weakest, together a thousandth, are left out and theirs is the others'."""
         return tuple(share for share, _, _ in self._modes)
 
-    def _at_doe(self, axis: int, wavelength_m: float) -> Pair:
-        """Radius of the lowest mode, metres, and curvature of the wavefront, 1/m, along an axis."""
-        radius, distance = self.radius_m[axis] / np.sqrt(self.m_squared[axis]), self.waist_distance_m
-        rayleigh = np.pi * radius**2 / wavelength_m
+    def _rayleigh_m(self, axis: int, wavelength_m: float) -> float:
+        """Rayleigh length of the modes along an axis."""
+        return np.pi * self.radius_m[axis] ** 2 / self.m_squared[axis] / wavelength_m
+
+    def _at(self, axis: int, wavelength_m: float, further_m: Any = 0.0) -> tuple[Any, Any]:
+        """Radius of the lowest mode, metres, and curvature of the wavefront, 1/m, so far beyond the DOE's middle."""
+        distance, rayleigh = self.waist_distance_m + further_m, self._rayleigh_m(axis, wavelength_m)
+        radius = self.radius_m[axis] / np.sqrt(self.m_squared[axis])
         return radius * np.sqrt(1 + (distance / rayleigh) ** 2), distance / (distance**2 + rayleigh**2)
 
     def curvature_per_m(self, wavelength_m: float) -> float:
         """Curvature of its wavefront at the DOE, the mean of both axes."""
-        return sum(self._at_doe(axis, wavelength_m)[1] for axis in (0, 1)) / 2
+        return float(sum(self._at(axis, wavelength_m)[1] for axis in (0, 1)) / 2)
 
     def diameters_m(self, wavelength_m: float) -> Pair:
         """Diameters (y, x) of the whole beam on the DOE, metres, where the intensity is 1/e² of that in the middle."""
-        y, x = (2 * self._at_doe(axis, wavelength_m)[0] * np.sqrt(self.m_squared[axis]) for axis in (0, 1))
+        y, x = (2 * self._at(axis, wavelength_m)[0] * np.sqrt(self.m_squared[axis]) for axis in (0, 1))
         return float(y), float(x)
 
     def amplitude_per_m(
         self, grid: Grid, aperture: Aperture, wavelength_m: float, mode: int
     ) -> Complex[np.ndarray, "y x"]:
-        """Amplitude `[y, x]` of a mode in the middle of every cell; its square times area sums to 1 over the plane."""
-        parts = []
-        for axis, name, number in ((0, "y", self._modes[mode][1]), (1, "x", self._modes[mode][2])):
-            radius, curvature = self._at_doe(axis, wavelength_m)
-            at = grid.axis_m(name) - self.centre_m[axis]  # pyright: ignore[reportArgumentType]
-            waves = curvature * at**2 / 2 / wavelength_m
-            parts.append(_hermite_gaussian(number, at, radius) * np.exp(2j * np.pi * (waves - np.rint(waves))))
-        return parts[0][:, None] * parts[1]
+        """Amplitude `[y, x]` of a mode in the middle of every cell; its square times area sums to 1 over the plane.
+
+        Its phase is less that along the axis of the beam, as for every beam. A beam that stands aslant crosses the DOE
+        at other distances from its waist and in a longer footprint.
+        """
+        tangents = np.tan(np.add(self.angle_rad, self.tilt_rad))
+        along = np.array([*tangents, 1.0]) / np.sqrt(1 + np.sum(tangents**2))  # of the axis (y, x, z)
+        place = np.stack(
+            [grid.axis_m("y")[:, None] + 0 * grid.axis_m("x"), grid.axis_m("x") + 0 * grid.axis_m("y")[:, None]]
+        )
+        place = place - np.array(self.centre_m)[:, None, None]
+        further = np.tensordot(along[:2], place, 1)
+        # Two axes across the beam: that of y in the plane of y and the beam, the other normal to both.
+        one = np.array([1.0, 0, 0]) - along[0] * along
+        one = one / np.sqrt(np.sum(one**2))
+        across = one, np.cross(one, along)
+        light: Any = np.sqrt(along[2])  # the footprint is longer by the inverse of its square
+        for axis, number in ((0, self._modes[mode][1]), (1, self._modes[mode][2])):
+            radius, curvature = self._at(axis, wavelength_m, further)
+            at = np.tensordot(across[axis][:2], place, 1)
+            turn = np.arctan((self.waist_distance_m + further) / self._rayleigh_m(axis, wavelength_m))
+            turn = turn - np.arctan(self.waist_distance_m / self._rayleigh_m(axis, wavelength_m))
+            waves = curvature * at**2 / 2 / wavelength_m - (number + 0.5) * turn / (2 * np.pi)
+            light = light * _hermite_gaussian(number, at, radius) * np.exp(2j * np.pi * (waves - np.rint(waves)))
+        return light
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +142,10 @@ class MeasuredBeam:
     centre_m: Pair = (0.0, 0.0)
     angle_rad: Pair = (0.0, 0.0)
     tilt_rad: Pair = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (np.all(np.isfinite(self.intensity)) and np.min(self.intensity) >= 0 < np.max(self.intensity)):
+            raise ValueError("`intensity` must be finite, nowhere negative and somewhere positive, but it is not")
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
@@ -151,7 +179,9 @@ class MeasuredBeam:
             for name, centre, count in zip(("y", "x"), self.centre_m, self.intensity.shape, strict=True)
         ]
         at = np.stack(np.meshgrid(*places, indexing="ij"))
-        seen = map_coordinates(np.asarray(self.intensity, np.float64), at, order=1, mode="constant")
+        seen = map_coordinates(np.asarray(self.intensity, np.float64), at, order=1, mode="nearest")
+        for place, count in zip(at, self.intensity.shape, strict=True):  # pixels end half a pixel beyond their centres
+            seen = np.where((place < -0.5) | (place > count - 0.5), 0.0, seen)
         return np.sqrt(seen / (self.intensity.sum(dtype=np.float64) * self.pixel_m**2)).astype(complex)
 
 
@@ -168,6 +198,10 @@ class EvenBeam:
     distance_m: float = np.inf
     angle_rad: Pair = (0.0, 0.0)
     tilt_rad: Pair = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.distance_m > 0:
+            raise ValueError(f"`distance_m` must be positive, but got {self.distance_m}")
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -209,7 +243,9 @@ def path_from_point_m(
     return (square - 2 * linear) / (path + chief) + linear / chief
 
 
-def _hermite_gaussian(number: int, at_m: Float[np.ndarray, " n"], radius_m: float) -> Float[np.ndarray, " n"]:
+def _hermite_gaussian(
+    number: int, at_m: Float[np.ndarray, "*n"], radius_m: float | Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
     """Hermite-Gaussian function of unit norm, 1/sqrt(m), by its recurrence; the lowest has the radius 1/e²."""
     place = np.sqrt(2) * at_m / radius_m
     below, here = np.zeros_like(place), (2 / np.pi) ** 0.25 / np.sqrt(radius_m) * np.exp(-(place**2) / 2)

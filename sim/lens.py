@@ -50,11 +50,8 @@ def sines_at(mapping: Mapping, distortion: Distortion, y: Any, x: Any) -> tuple[
     return y, x
 
 
-def farthest_place(mapping: Mapping, distortion: Distortion) -> float:
-    """Distance from the axis up to which every place sees a direction of its own, or infinity.
-
-    Beyond, a distortion folds the image over, or light would have to come from more than 90 degrees.
-    """
+def _turning_square(mapping: Mapping, distortion: Distortion) -> float:
+    """Square of the undistorted place, in sensor distances, from which on places see no direction of their own."""
     k1, k2 = distortion
     # The height p (1 + k1 p² + k2 p⁴) stops growing where 1 + 3 k1 q + 5 k2 q² = 0 at q = p².
     turns = [1.0 if mapping == "sine" else math.inf]
@@ -63,8 +60,26 @@ def farthest_place(mapping: Mapping, distortion: Distortion) -> float:
         turns += [(-3 * k1 + sign * math.sqrt(root)) / (10 * k2) for sign in (-1, 1) if root >= 0]
     elif k1:
         turns.append(-1 / (3 * k1))
-    square = min(turn for turn in turns if turn > 0)
+    return min(turn for turn in turns if turn > 0)
+
+
+def farthest_place(mapping: Mapping, distortion: Distortion) -> float:
+    """Distance from the axis up to which every place sees a direction of its own, or infinity.
+
+    Beyond, a distortion folds the image over, or light would have to come from more than 90 degrees.
+    """
+    k1, k2 = distortion
+    square = _turning_square(mapping, distortion)
     return math.inf if math.isinf(square) else math.sqrt(square) * (1 + square * (k1 + k2 * square))
+
+
+def distorted_place(mapping: Mapping, distortion: Distortion, sine: float) -> float:
+    """Distance from the axis, in sensor distances, where light of a direction sine lands; infinite where it folds."""
+    place = sine if mapping == "sine" else sine / math.sqrt(1 - sine**2)
+    square = place**2
+    if square >= _turning_square(mapping, distortion):
+        return math.inf
+    return place * (1 + square * (distortion[0] + distortion[1] * square))
 
 
 def check_lens(mapping: str, distortion: Distortion, corner: float, key: Callable[[str], str] = str) -> None:
@@ -95,5 +110,9 @@ def direction_sines(field_rad: tuple[float, float]) -> Float[np.ndarray, "2"]:
 
     The angles are those of its projections on the yz and xz planes, positive where light travels toward +y or +x.
     """
-    tangents = np.tan(np.asarray(field_rad, dtype=np.float64))
+    angles = np.asarray(field_rad, dtype=np.float64)
+    if not np.all(np.abs(angles) < np.pi / 2):
+        rule, cure = "light must come from before the DOE, within 90 degrees of its axis", "Choose smaller angles."
+        raise InputError("angles", rule, f"{np.degrees(angles).round(3).tolist()} degrees in all", cure)
+    tangents = np.tan(angles)
     return tangents / np.sqrt(1.0 + np.sum(tangents**2))

@@ -128,7 +128,9 @@ def _merged(
     """Mean of the rates, weighted by their inverse variance; zero where nothing is usable."""
     total = np.maximum((used * times).sum(axis=0), np.finfo(float).tiny)
     first = np.maximum((used * light).sum(axis=0) / total, 0.0)
-    weight = used * times**2 / (floor + first * times / gain_e)
+    variance = floor + first * times / gain_e
+    # Where nothing is noisy all count alike.
+    weight = used * times**2 / np.maximum(variance, 1e-9 * variance.max() or 1.0)
     share = weight / np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
     return MeasuredPsf(
         rate=(share * light / times).sum(axis=0),

@@ -141,6 +141,7 @@ class CellOptic(CameraOptic):
     ) -> FarField | DirectPath:
         """Operators of the far field, or of a direct kernel (which serves every depth)."""
         self.camera.require_upright(field_rad)
+        self.camera.require_image(field_rad)
         propagation = propagation or self.camera.propagation
         if propagation == "far_field":
             return plan_far_field(

@@ -87,7 +87,13 @@ class PsfBank(eqx.Module):
         return MetricInputs(self.energy, self.depths_m, self.camera, near_m, doe, nominal, lens and lens.energy, aimed)
 
     def metric(self, name: str) -> Table:
-        """A metric of `sim.metrics.METRICS` that needs nothing but PSFs and their camera, `[wavelength, depth]`."""
+        """A metric of `sim.metrics.METRICS` that needs nothing but PSFs and their camera, `[wavelength, depth]`.
+
+        A ValueError for another one.
+        """
+        known = [key for key, metric in METRICS.items() if metric.needs == "psf" and not metric.aimed]
+        if name not in known:
+            raise ValueError(f"`name` must be one of {', '.join(known)}, but got {name!r}")
         inputs, of = self.metric_inputs(), METRICS[name].of
         depths = range(len(self.depths_m))
         return stacked([stacked([of(inputs, c, d) for d in depths]) for c in range(len(self.colours))])
@@ -144,7 +150,8 @@ class PsfBank(eqx.Module):
         order = np.argsort([1 / depth for depth in self.depths_m])
         inverse = np.array([1 / self.depths_m[k] for k in order], np.float32)
         energy = jnp.asarray(self.energy[:, order].swapaxes(0, 1))
-        return BankOptic(energy, jnp.asarray(inverse), self.colours, self.pixel_m, self.camera)
+        own = self.colours, self.pixel_m, self.camera, self.field_rad, self.sines
+        return BankOptic(energy, jnp.asarray(inverse), *own)
 
     def at(self, depth_m: float) -> Float[np.ndarray, "c y x"] | Float[Array, "c y x"]:
         """PSFs of every colour at a depth, mixed linearly in 1/z; an InputError for a depth beyond the bank's."""
@@ -172,6 +179,8 @@ class BankOptic(Optic):
         colours: names of the colour channels.
         pixel_m: distance of the pixels, metres.
         camera: lens and sensor, where they are known.
+        field_rad: field angles (y, x) of the PSFs.
+        sines: whether pixels are direction sines.
     """
 
     energies: Float[Array, "d c y x"]
@@ -179,6 +188,8 @@ class BankOptic(Optic):
     colours: tuple[str, ...] = eqx.field(static=True)
     pixel_m: float = eqx.field(static=True)
     camera: Camera | None = eqx.field(static=True, default=None)
+    field_rad: tuple[float, float] = eqx.field(static=True, default=ON_AXIS)
+    sines: bool = eqx.field(static=True, default=False)
 
     @property
     def lines(self) -> tuple[SpectralLine, ...]:
@@ -193,10 +204,12 @@ class BankOptic(Optic):
         sampling: float | None = None,
         field_rad: tuple[float, float] = ON_AXIS,
     ) -> None:
-        """Nothing is propagated."""
+        """Nothing is propagated; a ValueError for another field than that of the PSFs, unless none is asked for."""
+        if any(field_rad) and not np.allclose(field_rad, self.field_rad):
+            raise ValueError(f"`field_rad` must be that of the bank, {self.field_rad}, but got {field_rad}")
 
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> np.ndarray:
-        """The source's curvature, 1/m; its field angle makes no difference."""
+        """The source's curvature, 1/m; all have the bank's field angle."""
         return np.asarray(1 / depth_m, np.float32)
 
     def energy(self, line: SpectralLine, plan: None, source: Float[Array, ""] | np.ndarray) -> Float[Array, "y x"]:
@@ -311,7 +324,9 @@ def psf(
             images[line.colour] = images[line.colour] + line.factor * next(found)
             on_psf()
         rows.append(stacked(images))
-    return PsfBank(stacked(rows, 1), chosen.colours, depths_m, chosen.pixel_m, field_rad, chosen.camera)
+    known = isinstance(chosen, BankOptic)
+    seen, sines = (chosen.field_rad, chosen.sines) if known else (field_rad, False)
+    return PsfBank(stacked(rows, 1), chosen.colours, depths_m, chosen.pixel_m, seen, chosen.camera, sines)
 
 
 def _energy(optic: Optic, line: SpectralLine, plan: Any, source: Any) -> Array:

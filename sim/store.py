@@ -196,6 +196,11 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
     return PsfBank(energy, colours, depths, stored, field, sines=sines)
 
 
+def is_own_bank(path: str | Path) -> bool:
+    """Whether an EXR file holds a PSF bank of this package; an InputError for no whole EXR file."""
+    return _BANK in _read_psfs(path)[1]
+
+
 def read_stored_bank(path: str | Path) -> StoredBank:
     """Read the PSF bank of our own at a path as plain arrays, without jax; an InputError for anything else."""
     channels, texts = _read_psfs(path)

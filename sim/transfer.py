@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from sim.camera import Camera, SpectralLine
 from sim.metrics import near_and_far
-from sim.optic import CellOptic
+from sim.optic import ON_AXIS, CellOptic
 from sim.propagation.pupil import DoeRows, SourceColumns, block_size, doe_field, in_blocks
 from sim.psf_bank import Length, depths_from, optic_of
 from sim.threads import at_once
@@ -77,15 +77,22 @@ def _row_spectra(rows: DoeRows, columns: SourceColumns) -> Array:
 
 
 def mtf(
-    optic: Any, camera: Camera | None = None, depths: Length | Sequence[Length] = np.inf, count: int = 160
+    optic: Any,
+    camera: Camera | None = None,
+    depths: Length | Sequence[Length] = np.inf,
+    count: int = 160,
+    *,
+    field_rad: tuple[float, float] = ON_AXIS,
 ) -> TransferBank:
     """MTF of a DOE along x, from zero to the sensor's Nyquist frequency.
 
     Args:
         optic: a DOE of cells, anything that carries one, or a height map `[y, x]` in metres on `camera.grid`.
         camera: lens, sensor, substrate and DOE grid of a bare height map.
-        depths: one source depth on the axis or several, in metres or with a unit; "inf" for a star.
+        depths: one source depth or several, in metres or with a unit; "inf" for a star.
         count: number of frequencies.
+        field_rad: field angles (y, x), radians; frequencies are those about the chief ray, behind a lens that images
+            sines.
 
     Raises:
         TypeError: an optic that is not made of cells.
@@ -104,7 +111,7 @@ def mtf(
     def power(asked: tuple[int, SpectralLine]) -> np.ndarray:
         """Spectrum of a line at a depth."""
         d, line = asked
-        return np.asarray(_row_spectra(*doe.rows(line, doe.source(line, depths_m[d]))), np.float64)
+        return np.asarray(_row_spectra(*doe.rows(line, doe.source(line, depths_m[d], field_rad))), np.float64)
 
     spectra = at_once(power, list(product(range(len(depths_m)), camera.lines)))
     for d, (k, weight) in product(range(len(depths_m)), enumerate(weights)):

@@ -166,7 +166,7 @@ def finest_detail_m(camera: Camera) -> float:
     D is the shorter side of an aperture that is not round.
     """
     scale = camera.lines[0].wavelength_m * camera.sensor_distance_m
-    finest = scale / camera.opening.narrowest_m
+    finest = scale / min(camera.opening.sizes_m)
     if not isinstance(camera.beam, GaussianBeam):
         return 2 * finest
     quality = np.sqrt(np.prod(camera.beam.m_squared))

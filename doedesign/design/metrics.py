@@ -31,13 +31,18 @@ from sim.threads import at_once
 
 
 def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank) -> list[dict[str, Any]]:
-    """Return one row per depth and colour of a bank on the axis: metrics (`sim.metrics`) and energy budget.
+    """Return one row per depth and colour of a bank: metrics (`sim.metrics`) and, on the axis, the energy budget.
 
+    Off the axis what is of the DOE and not of its PSFs, as the 0th order, is left out: it is known on the axis.
     `near_m` are those of its depths, metres, that are obstructions; `lens` has the plain lens at the same depths, and
     the DOE's grid: with light of walls, the optic's cells may be parts of its cells.
     """
     pitch = lens.metric_inputs().camera.grid.pitch_m
-    rows = without_infinities(metric_rows(bank.metric_inputs(near_m, optic, lens=lens), "design"))
+    on_axis = not any(bank.field_rad)
+    inputs = bank.metric_inputs(near_m, optic if on_axis else None, lens=lens)
+    rows = without_infinities(metric_rows(inputs, "design"))
+    if not on_axis:
+        return rows
     places = list(product(range(len(bank.depths_m)), range(len(bank.colours))))
 
     def budget(place: tuple[int, int]) -> EnergyBudget:

@@ -139,7 +139,9 @@ def _picture(camera: Camera, path: Path) -> Image:
     light = picture_light(path)
     shape = [max(1, round(camera.window * side / max(light.shape))) for side in light.shape]
     room = [camera.window - side for side in shape]
-    return np.pad(resize(light, shape, anti_aliasing=True), [(side // 2, side - side // 2) for side in room])
+    return np.pad(
+        np.asarray(resize(light, shape, anti_aliasing=True)), [(side // 2, side - side // 2) for side in room]
+    )
 
 
 def target_image(camera: Camera, options: dict[str, Any], picture: Path | None, where: str) -> Image:

@@ -12,6 +12,7 @@ Sources: J. Jung et al., BOSON-1, arXiv:2411.08210 (worst cases in the loop); R.
 2, 21 (2000) (the mean of the worst, CVaR).
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -153,7 +154,10 @@ class RobustTask(NamedTuple):
         if self.robust.measure != "mean":
             return range(count), 1.0  # which ones are the worst shows in the same light alone
         pairs = -(-count // 2)
-        first = 2 * (place % pairs)
+        pair = place
+        if self.spec.optimize.colours == "in_turn" and math.gcd(pairs, len(self.problem.camera.colours)) > 1:
+            pair += place // pairs  # or every plate would be seen in some colours alone
+        first = 2 * (pair % pairs)
         seen = range(first, min(first + 2, count))
         return seen, len(seen) * pairs / count
 

@@ -145,7 +145,7 @@ def _write(
     camera = camera_from_spec(run.spec)
     flat, depths, field = HeightOptic.of(camera), (*near, *far), banks["quantised"].field_rad
     lens = psf(flat, depths=depths, field_rad=field)
-    lens_transfer = mtf(flat, depths=depths)
+    lens_transfer = mtf(flat, depths=depths, field_rad=field)
     metrics: dict[str, Any] = {"lens": camera.lens_text, "light": camera.light}
     within = encircled_curves([*(banks[name] for name in optics), lens])
     with drawn_beside() as draw:
@@ -154,7 +154,7 @@ def _write(
             write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name, "lens": camera.lens_text})
             whose = f"{run.spec.name}, {name.replace('_', ' ')}"
             draw(folder / f"{name}_psf.png", plot_psfs, bank, camera, near, far, title=whose)
-            transfer = mtf(optic, depths=depths)
+            transfer = mtf(optic, depths=depths, field_rad=field)
             draw(folder / f"{name}_mtf.png", plot_mtf, transfer, camera, near, far, lens_transfer, title=whose)
             picture = folder / f"{name}_encircled.png"
             draw(picture, plot_encircled, bank, camera, near, far, lens, title=whose, curves=curves)

@@ -170,7 +170,12 @@ def _lens(spec: Spec) -> Iterator[InputError]:
         rule = "with the sensor beyond the focus it must stay below focal_length² / (2 defocus)"
         got, cure = format_length(optics.doe_distance_m), "Move the DOE to the lens or the sensor into focus."
         yield InputError("optics.doe_distance", rule, got, cure)
-    corner = sensor.window_m / math.sqrt(2) / (optics.focal_length_m + sensor.defocus_m)
+    distance_m = optics.focal_length_m + sensor.defocus_m
+    if optics.mapping == "sine" and not any(optics.distortion) and sensor.window_m > 2 * distance_m * (1 + 1e-9):
+        rule, cure = "a lens that images sines ends at a sine of 1", "Choose a smaller window."
+        yield InputError("sensor.window", rule, f"{sensor.window_m / 2 / distance_m:.3g} at the window's edge", cure)
+        return
+    corner = sensor.window_m / math.sqrt(2) / distance_m
     try:
         check_lens(optics.mapping, optics.distortion, corner, "optics.{}".format)
     except InputError as error:

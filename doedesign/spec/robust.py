@@ -43,6 +43,9 @@ class RobustSpec(SpecTable, frozen=True):
     learning_rate: Positive = 0.1
 
 
+_MOST_SEEN = 40  # plates in a round of 20 steps, a pair in each (`doedesign.design.robust.ROUND`)
+
+
 def robust_problems(spec: "Spec") -> Iterator[InputError]:
     """Return every rule that a robust design breaks."""
     robust, optimize = spec.robust, spec.optimize
@@ -51,6 +54,9 @@ def robust_problems(spec: "Spec") -> Iterator[InputError]:
     if robust.measure == "yield" and robust.limit is None:
         cure = "For example limit = 1.5; history.jsonl has the losses of a run."
         yield InputError("robust.limit", '"yield" needs the loss of a good plate', "nothing", cure)
+    if robust.measure == "mean" and robust.draws > _MOST_SEEN:
+        rule = f'"mean" looks at {_MOST_SEEN} plates at most before others are drawn'
+        yield InputError("robust.draws", rule, robust.draws, "Choose fewer, or another measure.")
     yield from _source_problems(spec, robust)
     if not spec.objectives:
         yield InputError("robust", "it minimises the loss of [[objective]]", "none", "Add one, or remove [robust].")

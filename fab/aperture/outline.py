@@ -85,12 +85,12 @@ class Aperture(ABC):
 
     @property
     def widest_m(self) -> float:
-        """Longer side of the box around it, metres; the diameter of a round one."""
+        """Longer side of the box around it with the origin in its middle, metres; the diameter of a round one."""
         return max(self.extent_m)
 
     @property
     def narrowest_m(self) -> float:
-        """Shorter side of the box around it, metres; the diameter of a round one."""
+        """Shorter side of the box around it with the origin in its middle, metres; the diameter of a round one."""
         return min(self.extent_m)
 
 

@@ -9,6 +9,7 @@ from scipy.fft import fft
 
 from sim.camera import Colour
 from sim.metrics.measures import far_spot
+from sim.metrics.transmission import opening
 from sim.optic import CellOptic
 from sim.source import source_path_m
 from sim.tracing import total
@@ -83,16 +84,15 @@ def energy_budget(
     curvature = camera.curvature_per_m(1 / depth_m) if camera.distance_m is None else 1 / depth_m
     for line in replace(camera, colours=(colour,)).lines:
         field = np.asarray(optic.field(line, depth_m))
-        wavelength, open_ = line.wavelength_m, 1.0
+        wavelength = line.wavelength_m
+        open_ = float(opening(optic, wavelength))
+        if camera.beam is None and abs(open_ - 1) < 1e-6:
+            open_ = 1.0  # to rounding
         if camera.distance_m is not None:  # the band is one of directions behind the DOE, not of places
             field = field * np.exp(-2j * np.pi * source_path_m(camera, np.inf) / wavelength).astype(np.complex64)
-        if (light := camera.incident(line)) is not None:
-            open_ = float(np.sum(np.abs(light) ** 2 * np.asarray(optic.coverage), dtype=np.float64))
-            open_ *= cells / scale
         slope = (curvature + camera.beam_curvature_per_m(wavelength)) * camera.grid.pitch_m**2 / wavelength
         entered += line.factor / camera.transmission(wavelength) * open_
         passed += line.factor * open_
         band += line.factor * _band_energy(field, slope, reach) / scale
     energy, spot = float(total(psf)), float(far_spot(psf, camera, colour))
-    lost = 0.0 if camera.beam is None else 1 - entered
-    return EnergyBudget(lost, entered - passed, spot, energy - spot, band - energy, passed - band)
+    return EnergyBudget(1 - entered, entered - passed, spot, energy - spot, band - energy, passed - band)

@@ -32,8 +32,8 @@ def disc_weights(shape: tuple[int, int], pixel_m: float, radius_m: float) -> Flo
 
 
 def airy_radius_m(camera: Camera, wavelength_m: float) -> float:
-    """Radius of the first dark ring of the ideal lens, 1.22 lambda d / D; D is the shorter side of other apertures."""
-    return 1.2197 * wavelength_m * camera.sensor_distance_m / camera.opening.narrowest_m
+    """Radius of the first dark ring of the ideal lens, 1.22 lambda d / D; D of others: shorter side of their box."""
+    return 1.2197 * wavelength_m * camera.sensor_distance_m / min(camera.opening.sizes_m)
 
 
 def mean_wavelength_m(colour: Colour) -> float:

@@ -119,6 +119,7 @@ class Metric:
     worse: Literal["high", "low"] | None = None
     unit: Literal["1", "%", "m"] = "1"  # "1", "m", or "%" for a share, which is shown in per cent
     aimed: bool = False  # whether it is known only of a DOE that should draw something
+    needs: Literal["psf", "doe", "lens"] = "psf"  # what it cannot be told without: the DOE, or the bare lens's PSFs
     definition: str = ""  # what it is, with its formula; the reference of numbers takes it from here
 
     @property
@@ -143,6 +144,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             _BOTH,
             worse="high",
             unit="%",
+            needs="doe",
             definition="share of the light that passes as if the DOE were flat: |c0|², c0 the mean transmission over "
             "the open cells, weighted by the irradiance of the beam",
         ),
@@ -151,6 +153,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             lambda e, c, d: e.strehls[c],
             ("fabricated",),
             worse="low",
+            needs="doe",
             definition="overlap of the field behind the DOE with that of the design exactly as drawn, |mean of t "
             "conj(t_drawn)|²: 1 for a plate made as drawn, whatever share of the light its design puts in "
             "the spot (that is far_spot)",
@@ -170,6 +173,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             ("fabricated",),
             worse="high",
             unit="%",
+            needs="doe",
             definition="share of the light that passes opening and glass and misses the sensor window",
         ),
         "chrome": Metric(
@@ -177,6 +181,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             lambda e, c, d: e.passed(c) - e.passed_as_drawn(c),
             ("fabricated",),
             unit="%",
+            needs="doe",
             definition="light that the chrome opening of the plate lets through beyond that of the design as drawn; "
             "negative where it blocks more",
         ),
@@ -203,6 +208,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             lambda e, c, d: e.concentration(c, d),
             ("design",),
             "near",
+            needs="lens",
             definition="sum of the squared pixel energies over that of the plain lens at the same depth: 1 for the "
             "lens, less for light that is spread",
         ),
@@ -211,6 +217,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             lambda e, c, d: e.concentration_bound(c, d),
             ("design",),
             "near",
+            needs="lens",
             definition="least concentration of a near PSF that keeps all light in the window: s² + (1 - s)² a, s the "
             "largest far_spot of the colour over the lens's light in the window, a the lens's defocus disc "
             "as a share of the window; light that leaves the window may take a PSF below it",
@@ -268,7 +275,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 def metric_rows(inputs: MetricInputs, table: Literal["design", "fabricated"]) -> list[dict[str, Any]]:
     """One row per depth and colour: `colour`, `depth_m` (None for infinity) and the metrics of a table.
 
-    A ring:disc ratio without any light in the disc is infinite. Lengths on a sensor are angles where there is none, and
+    What needs a DOE or the bare lens is left out without them. A ring:disc ratio without any light in the disc is
+    infinite. Lengths on a sensor are angles where there is none, and
     their names end in `_rad`.
     """
     rows = []
@@ -278,6 +286,8 @@ def metric_rows(inputs: MetricInputs, table: Literal["design", "fabricated"]) ->
             row: dict[str, Any] = {"colour": colour.name, "depth_m": None if np.isinf(depth) else depth}
             for name, metric in METRICS.items():
                 if metric.aimed and (c > 0 or name not in (inputs.aimed or {})):
+                    continue
+                if metric.needs != "psf" and getattr(inputs, metric.needs) is None:
                     continue
                 if table in metric.tables and metric.depths in shown:
                     value = metric.of(inputs, c, d)

@@ -148,6 +148,14 @@ def test_a_budget_for_rare_events_scales_their_rates(process: Process):
     assert counts[1] == pytest.approx(240, rel=0.2)
     assert counts[3] == pytest.approx(720, rel=0.2)
     assert plate(process, "budget/defects/0/3").depth_scale == plate(process, "normal/3").depth_scale
+    # The same plates but for what is rarer or more frequent.
+    for i in range(10):
+        few, many = (plate(process, f"budget/defects/{factor}/{i}") for factor in (0.5, 2))
+        assert set(few.particles) <= set(many.particles)
+        assert set(few.pinholes) <= set(many.pinholes)
+        none = {"particles": (), "pinholes": (), "repeats": ()}
+        assert dataclasses.replace(few, **none) == dataclasses.replace(many, **none)
+    assert budget_keys("defects", (1.0,), 2) == ["budget/defects/1/0", "budget/defects/1/1"]
 
 
 @pytest.mark.parametrize(

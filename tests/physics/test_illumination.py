@@ -6,11 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fab.aperture import RectangularAperture, aperture_from
+from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import Process, Variation
 from sim.camera import Camera, Colour
-from sim.illumination import GaussianBeam, MeasuredBeam
+from sim.illumination import EvenBeam, GaussianBeam, MeasuredBeam
 from sim.metrics import energy_budget, zeroth_order
 from sim.optic import HeightOptic, RingOptic
 from sim.propagation.hankel import ring_count
@@ -160,10 +162,14 @@ def test_light_with_edges_has_the_beam():
 
 
 def test_a_tilted_beam_lands_where_its_axis_goes():
-    """The window follows the chief ray: a tilt changes the image by the lens's mapping alone."""
+    """The window follows the chief ray: its footprint is longer by 1 / cos, so the image is shorter by cos."""
     camera = replace(CAMERA, beam=GaussianBeam((WAIST, WAIST), angle_rad=(0.0, 0.05)))
     tilted, straight = (np.asarray(psf(HeightOptic.of(one)).energy[0, 0]) for one in (camera, CAMERA))
-    np.testing.assert_allclose(tilted, straight, atol=1e-6 * straight.max())
+    axis = CAMERA.axis_m()
+    tall, wide = ((tilted * axis2).sum() / (straight * axis2).sum() for axis2 in (axis[:, None] ** 2, axis**2))
+    assert tall == pytest.approx(1, abs=1e-4)
+    assert wide == pytest.approx(np.cos(0.05) ** 2, abs=2e-4)
+    assert tilted.sum() == pytest.approx(straight.sum(), rel=1e-4)
     grating = np.zeros(CAMERA.grid.shape) + 1e-6 * (np.arange(256) % 2)
     tilted, straight = (zeroth_order(HeightOptic.of(one, grating))[0] for one in (camera, CAMERA))
     waves = 1e-6 * (np.sqrt(1.4607**2 - 0.05**2) - np.sqrt(1 - 0.05**2)) / WAVE
@@ -181,3 +187,45 @@ def test_a_beam_of_many_modes_has_all_its_power():
 def test_rings_are_not_lit_by_a_beam():
     with pytest.raises(ValueError, match="must be lit evenly for rings"):
         psf(RingOptic(CAMERA, jnp.zeros(ring_count(CAMERA))))
+
+
+def test_an_aslant_beam_is_that_of_its_own_plane():
+    """Far behind its waist a beam is light from a point; its power is the same on any plane that it crosses."""
+    grid, point, angle = Grid((128, 128), 2e-6), 20e-3, (0.2, 0.35)
+    aperture = aperture_from(256e-6)
+    waist = 5e-6  # Rayleigh length 0.15 mm
+    beam = GaussianBeam(
+        (waist, waist), waist_distance_m=point * np.sqrt(1 + np.sum(np.tan(angle) ** 2)), angle_rad=angle
+    )
+    even = EvenBeam(point, angle)
+    found, known = (one.amplitude_per_m(grid, aperture, WAVE, 0) for one in (beam, even))
+    phase = np.angle(found * known.conj() / (found[64, 64] * known[64, 64].conj()))
+    assert np.abs(phase).max() < 0.02  # of 20 waves at the corners; a beam at normal incidence is off by half of one
+    wide = Grid((256, 256), 4e-6)
+    for tilt in ((0.0, 0.0), (0.0, 0.9), (0.5, 0.5)):
+        light = GaussianBeam((0.1e-3, 0.15e-3), tilt_rad=tilt).amplitude_per_m(wide, aperture, WAVE, 0)
+        assert (np.abs(light) ** 2).sum() * wide.pitch_m**2 == pytest.approx(1, abs=2e-3)
+
+
+def test_beams_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="two positive lengths"):
+        GaussianBeam((0.0, 1e-3))
+    with pytest.raises(ValueError, match="must be positive"):
+        EvenBeam(0.0)
+    with pytest.raises(ValueError, match="somewhere positive"):
+        MeasuredBeam(np.zeros((4, 4)), 1e-6)
+    point = replace(CAMERA, beam=EvenBeam(0.02))
+    with pytest.raises(InputError, match="a beam from a point has an angle of its own"):
+        psf(HeightOptic.of(point), field_rad=(0.0, 0.1))
+    aslant = replace(CAMERA, beam=EvenBeam(angle_rad=(0.0, 1.0), tilt_rad=(0.0, 1.0)))
+    with pytest.raises(InputError, match="within 90 degrees of its axis"):
+        psf(HeightOptic.of(aslant))
+
+
+def test_a_picture_of_a_beam_ends_with_its_pixels():
+    """Even over a square as large as the opening: all of its power goes through."""
+    beam = MeasuredBeam(np.ones((10, 10)), 25.6e-6)
+    square = replace(CAMERA, grid=Grid((128, 128), 2e-6), aperture=RectangularAperture((256e-6, 256e-6)), beam=beam)
+    irradiance = square.irradiance(WAVE)
+    assert irradiance is not None
+    assert irradiance.sum() * 2e-6**2 == pytest.approx(square.opening.area_m2, rel=1e-6)
