@@ -18,7 +18,7 @@ from sim.tracing import total
 class EnergyBudget(NamedTuple):
     """Where the power incident on the clear aperture goes, or that of the beam; the six parts sum to 1."""
 
-    blocked: float  # of the beam by the chrome around the opening; 0 without a beam
+    blocked: float  # by the chrome: of a beam, or of what should pass; below 0 where the opening is too wide
     reflected: float  # by the two faces of the substrate
     far_spot: float  # inside the far-spot radius of the window, at every depth
     window_beside_spot: float  # elsewhere in the sensor window: throughput less far_spot

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -48,11 +47,7 @@ class WithLimits:
     limits: ClassVar[Mapping[str, Range]]
 
     def __post_init__(self) -> None:
-        """Check every parameter: an InputError for one beyond its limits. A number for a range is a fixed value."""
-        for one in fields(self):  # pyright: ignore[reportArgumentType]
-            given = getattr(self, one.name, None)  # some are set later
-            if one.type in (Range, "Range") and isinstance(given, int | float):
-                object.__setattr__(self, one.name, (float(given), float(given)))
+        """Check every parameter, and raise an InputError for one that leaves its limits."""
         for parameter, (low, high) in self.limits.items():
             given, where = getattr(self, parameter), f"{self.name}: {parameter}"
             if np.ndim(given):

@@ -178,6 +178,10 @@ def test_psf_of_other_depths_and_fields(copied, cli):
     assert bank.depths_m == (0.008, float("inf"))
     assert bank.field_rad == pytest.approx((np.radians(1), np.radians(-2)))
     assert (copied.run / "psf" / "from_masks.exr").read_bytes() == (copied.run / "psf" / "quantised.exr").read_bytes()
+    # The 0th order and the band are known on the axis.
+    told = json.loads((copied.run / "psf" / "metrics.json").read_text())["quantised"]
+    assert all("throughput" in row for row in told)
+    assert not any({"zeroth_order", "budget"} & set(row) for row in told)
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -94,6 +94,8 @@ def test_an_exr_in_colour_gives_the_channel_that_is_named(tmp_path: Path):
     for number, channel in enumerate(("red", "green", "blue")):
         frame = read_frame(tmp_path / "rgb.exr", channel=channel, pixel_m=3.7e-6)
         np.testing.assert_array_equal(frame.counts, image[number, 0])
+    write_bank(tmp_path / "own.exr", PsfBank(image, ("red", "green", "blue"), (0.1,), 3.7e-6))
+    np.testing.assert_array_equal(read_frame(tmp_path / "own.exr", channel="green").counts, image[1, 0])
     write_bank(tmp_path / "ab.exr", PsfBank(image[:2], ("A", "B"), (0.1,), 3.7e-6))
     with pytest.raises(InputError, match="must have one colour, or red, green, blue, but got the colours A, B"):
         read_frame(tmp_path / "ab.exr", channel="red", pixel_m=3.7e-6)

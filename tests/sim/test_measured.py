@@ -181,3 +181,15 @@ def test_a_parabola_has_its_vertex_where_it_is(vertex: float):
 def test_what_is_no_peak_has_its_vertex_on_itself():
     assert parabola_vertex(np.array([0.0, 1.0, 2.0, 3.0]), 1) == 0.0  # a line
     assert parabola_vertex(np.array([1.0, 0.0, 1.0, 0.0]), 1) == 0.0  # a dip
+
+
+def test_light_without_any_noise_is_merged():
+    """A clean simulation in an EXR file, dark around its spot."""
+    rate = np.zeros((20, 20))
+    rate[8:12, 8:12] = 100.0
+    frames = [
+        CameraFrame((rate * t).astype(np.float32), np.ones(rate.shape, bool), np.inf, 0.0, 0.0) for t in (1.0, 2.0)
+    ]
+    merged = merge_exposures(frames, (1.0, 2.0), [0.0] * 2, Noise(1.0, 0.0))
+    np.testing.assert_allclose(merged.rate, rate, atol=1e-6)
+    assert merged.valid.all()

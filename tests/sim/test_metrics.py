@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.reference import make_camera, wrapped_map
+from fab.aperture import MaskAperture
 from fab.grid import Grid
 from sim.camera import Colour
 from sim.metrics import (
@@ -208,3 +209,32 @@ def test_no_even_halo_around_the_lens_disc_is_below_the_bound(share: float):
     assert inputs.concentration(0, 0) == pytest.approx(found, rel=1e-5)
     assert inputs.concentration_bound(0, 0) <= found + 1e-6
     assert MetricInputs(own[:, :1], (0.1,), camera, near_m=(0.1,), lens=lens[:, :1]).concentration_bound(0, 0) is None
+
+
+def test_the_far_spot_of_an_opening_off_the_centre_is_that_of_its_size():
+    corner = np.zeros((64, 64), bool)
+    corner[:16, :16] = True
+    centred = np.roll(corner, (24, 24), (0, 1))
+    radii = [
+        spot_radius_m(dataclasses.replace(CAMERA, grid=Grid((64, 64), 4e-6), aperture=MaskAperture.of(one, 4e-6)), 5e-7)
+        for one in (corner, centred)
+    ]
+    assert radii[0] == radii[1]
+
+
+def test_light_that_the_chrome_blocks_is_lost_and_no_higher_order():
+    """A flat plate whose opening has 0.64 of the area that it should have."""
+    optic = HeightOptic.of(CAMERA)
+    narrow = HeightOptic.of(dataclasses.replace(CAMERA, aperture=0.48e-3))
+    optic = dataclasses.replace(optic, coverage=narrow.coverage)
+    budget = energy_budget(optic, psf(optic).energy[0, 0], np.inf, CAMERA.colours[0])
+    assert budget.blocked == pytest.approx(0.36, abs=1e-3)
+    assert abs(budget.higher_orders) < 4e-3  # scattered by the rim
+    assert sum(budget) == pytest.approx(1, abs=1e-9)
+
+
+def test_numbers_of_a_bank_are_those_of_its_psfs_alone():
+    bank = psf(HeightOptic.of(CAMERA))
+    for name in ("zeroth_order", "concentration", "on_target", "sharpness"):
+        with pytest.raises(ValueError, match="`name` must be one of throughput"):
+            bank.metric(name)

@@ -96,3 +96,29 @@ def test_an_oblique_field_is_the_same_lens_seen_under_an_angle():
     np.testing.assert_array_equal(on, off)
     ruled = psf(HEIGHT, ONE, [np.inf], field_rad=(0.2, 0.0)).energy
     assert relative_error(ruled, psf(HEIGHT, ONE, [np.inf]).energy.astype(np.float64)) > 0.01
+
+
+def test_psfs_of_a_bank_keep_its_field():
+    field = (0.0, 0.1)
+    bank = psf(HEIGHT, ONE, [0.02, np.inf], field_rad=field)
+    again = psf(bank, depths=np.inf)
+    assert again.field_rad == field
+    np.testing.assert_array_equal(again.energy[:, 0], bank.energy[:, 1])
+    with pytest.raises(ValueError, match="`field_rad` must be that of the bank"):
+        psf(bank, field_rad=(0.0, 0.2))
+    assert psf(dataclasses.replace(bank, camera=None, sines=True), depths=0.02).sines
+
+
+def test_an_image_that_folds_over_off_the_axis_is_refused():
+    """A barrel that ends at 1.2 times the angle of this chief ray's tangent."""
+    lens = dataclasses.replace(ONE, mapping="tangent", distortion=(-0.4, 0.0))
+    psf(HEIGHT, lens, field_rad=(0.0, 0.3))
+    with pytest.raises(InputError, match="distortion: the image must not fold over"):
+        psf(HEIGHT, lens, field_rad=(0.0, 0.8))
+
+
+def test_a_colour_and_pixels_that_cannot_be_are_refused():
+    with pytest.raises(InputError, match="weights: must be one for each wavelength, together 1"):
+        Colour("a", (5e-7, 6e-7), (1.0, 1.0))
+    with pytest.raises(InputError, match="fill: must lie above 0, up to 1"):
+        dataclasses.replace(ONE, fill=2.0)

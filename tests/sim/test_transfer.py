@@ -39,3 +39,15 @@ def test_light_does_not_depend_on_the_window():
     height = wrapped_map(200)
     first, second = (mtf(height, camera, [0.05, np.inf]) for camera in (narrow, wide))
     assert np.array_equal(first.transfer, second.transfer)
+
+
+def test_under_an_angle_it_is_that_of_the_psf_there():
+    """Of a rough plate, at 20 degrees: its phase is another than on the axis."""
+    camera, field = make_camera(64, 0.32e-3, 4e-3, 1.5e-6, 1000), (0.0, np.radians(20))
+    height = wrapped_map(64)
+    found = mtf(height, camera, [0.08], count=40, field_rad=field)
+    image = psf(height, camera, [0.08], field_rad=field).energy[0, 0].astype(np.float64)
+    spectrum = np.abs(np.exp(-2j * np.pi * np.outer(found.frequencies_per_m, camera.axis_m())) @ image.sum(axis=0))
+    np.testing.assert_allclose(found.transfer[0, 0], spectrum / image.sum(), atol=0.02)
+    on_axis = mtf(height, camera, [0.08], count=40)
+    assert np.abs(found.transfer - on_axis.transfer).max() > 2e-3
