@@ -356,6 +356,7 @@ def test_rows_that_were_joined_are_those_of_the_later_run(path: Path):
         "seed1": set(),
         "robust": {"robust", "robust_fabricated", "robust_untold"},
         "biharmonic": {"biharmonic_of_capture"},
+        "optics": {"optics_only_fabricated"},
         "captures": JOINED_CAPTURES.get(path.stem, set()),
     }[path.parent.name]
     for one in joined:

@@ -36,6 +36,7 @@ def test_rows_of_a_later_run_are_joined(tmp_path: Path):
         table.writeheader()  # as the tables of one run once were, without a column for it
         table.writerows({k: v for k, v in one.items() if k != "run"} for one in lines if one["run"] == "1")
     joined = {"robust": ROBUST, "biharmonic": ["biharmonic_of_capture"], "captures": CAPTURES}
+    joined["optics"] = ["optics_only_fabricated"]
     for later, rows in joined.items():
         given = [str(path), "--later", str(RESULTS / "later" / later / NAME), "--rows", *rows]
         assert joined_tables.main(given) == 0
