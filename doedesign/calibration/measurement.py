@@ -224,9 +224,6 @@ def _problems(spec: MeasurementSpec) -> Iterator[InputError]:
     if spec.collimator_m is not None and spec.mode_field_m is None:
         cure = 'Add mode_field = "3.5 um", or leave it out.'
         yield InputError("collimator", "goes with a mode_field", format_length(spec.collimator_m), cure)
-    elif spec.collimator_m is not None and all(math.isfinite(image.depth_m) for image in spec.image):
-        rule, cure = "goes with an image at infinity", 'Leave it out, or give an image depth = "inf".'
-        yield InputError("collimator", rule, "none", cure)
     names = [image.called for image in spec.image]
     for i, image in enumerate(spec.image):
         key, count = f"image[{i}]", len(image.files)

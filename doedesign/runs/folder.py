@@ -74,7 +74,8 @@ _FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "d
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
 _UNFINISHED = re.compile(
-    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|csv|png|html)|(psf|fabricated|certificate|calibration|explanations|as-built)\.new)\.[a-z0-9_]{8}"
+    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|csv|png|html)|psf|fabricated|certificate|calibration|explanations|as-built)"
+    r"\.doedesign-(file|new|old)\.[a-z0-9_]{8}"
 )
 
 

@@ -65,7 +65,7 @@ def read_any_height(
         raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Give the pitch of a pixel.")
     ny, nx = stored.height_m.shape
     grid = Grid((ny, nx), pitch_m)
-    outline = outline_of(stored.height_m, grid, aperture or stored.aperture, str(path))
+    outline = outline_of(stored.height_m, grid, stored.aperture if aperture is None else aperture, str(path))
     return HeightMap(stored.height_m, grid, outline)
 
 

@@ -86,7 +86,7 @@ def energy_budget(
         field = np.asarray(optic.field(line, depth_m))
         wavelength = line.wavelength_m
         open_ = float(opening(optic, wavelength))
-        if camera.beam is None and abs(open_ - 1) < 1e-6:
+        if camera.beam is None and abs(open_ - 1) < 1e-5:
             open_ = 1.0  # to rounding
         if camera.distance_m is not None:  # the band is one of directions behind the DOE, not of places
             field = field * np.exp(-2j * np.pi * source_path_m(camera, np.inf) / wavelength).astype(np.complex64)

@@ -153,7 +153,10 @@ def test_locks_may_be_missing(run: Run, monkeypatch: pytest.MonkeyPatch):
 
 def test_only_temporary_files_are_cleared_away(run: Run):
     kept = [".gitignore", ".notes.txt.abcdefgh", "checkpoint.npz.abcdefgh", ".height.exr.bak", ".psf.exr"]
-    swept = [".checkpoint.npz.abcd_123", ".manifest.json.00000000", ".height_continuous.exr.zzzzzzzz"]
+    kept += [".checkpoint.npz.original", ".psf.new.abcdefgh"]  # of people
+    swept = [
+        f".{name}.doedesign-file.abcd_123" for name in ("checkpoint.npz", "manifest.json", "height_continuous.exr")
+    ]
     for name in kept + swept:
         run.path(name).write_text("")
     run.path(".psf.doedesign-new.abcdefgh").mkdir()

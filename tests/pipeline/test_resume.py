@@ -142,8 +142,8 @@ def test_stopped_at_every_few_writes(tiny, cli, content, tmp_path, monkeypatch, 
 @pytest.mark.usefixtures("without_pictures")
 def test_what_a_killed_process_was_writing_is_cleared_away(copied, tiny, cli, content):
     before = content(copied.run)
-    (copied.run / ".checkpoint.npz.k2_x81ab").write_bytes(b"half")
-    (copied.run / ".manifest.json.00000000").write_bytes(b"")
+    (copied.run / ".checkpoint.npz.doedesign-file.k2_x81ab").write_bytes(b"half")
+    (copied.run / ".manifest.json.doedesign-file.00000000").write_bytes(b"")
     (copied.run / ".psf.doedesign-new.abcdefgh").mkdir()
     (copied.run / ".psf.doedesign-new.abcdefgh" / "continuous.exr").write_bytes(b"half")
     assert cli("optimize", tiny, "--out", copied.run).code == 0
@@ -153,7 +153,7 @@ def test_what_a_killed_process_was_writing_is_cleared_away(copied, tiny, cli, co
 @pytest.mark.slow
 def test_killed_before_the_manifest_was_whole(tiny, cli, tmp_path):
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / ".manifest.json.k2_x81ab").write_bytes(b"half")
+    (tmp_path / "run" / ".manifest.json.doedesign-file.k2_x81ab").write_bytes(b"half")
     assert cli("optimize", tiny, "--out", tmp_path / "run", "--set", "optimize.steps=0").code == 0
 
 
