@@ -105,6 +105,8 @@ def simulate_files(
     kind, model, view, far_m = Stage.of(design, obstruction, occlusion, size)
     pictures = Pictures(picture_files(images), most_px=2 * max(view.shape))
     count = min(_USUAL_COUNT, len(pictures)) if count is None else count
+    if not 0 <= seed < 1 << 32:
+        raise InputError("seed", "must be from 0 to 4294967295", seed, "For example 0.")
     if count < 1:
         raise InputError("count", "must be at least 1", count, "Leave it out for one item per picture, at most six.")
     data = SceneData(pictures, kind, view, far_m, seed, mirrored=False)

@@ -121,6 +121,8 @@ def evaluate(
     for name, value in (("pairs", pairs), ("draws", draws), ("seeds", len(seeds))):
         if value < 1:
             raise InputError(name, "must be at least 1", value, "Give one or more.")
+    if not 0 <= seed < 1 << 32:
+        raise InputError("seed", "must be from 0 to 4294967295", seed, "For example 0.")
     run, programs = Path(source), [ExternalMethod.parse(text) for text in methods]
     folder = run / "evaluation" if out is None else Path(out)
     with stoppable():

@@ -21,10 +21,12 @@ process at a time works in a run folder.
 """
 
 import contextlib
+import glob
 import json
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -198,18 +200,45 @@ def claim_run(
     cure = "Choose another output folder."
     if folder.exists() and not folder.is_dir():
         raise InputError(str(folder), "a run needs a folder", "a file", cure)
-    with alone_in(folder):
+    with alone_in(folder), _replaced_or_restored(folder):
         known = (folder / MANIFEST_NAME).is_file()
         if not known and any(folder.iterdir()):
             raise InputError(str(folder), "a run needs a new or empty folder, or its own", "other content", cure)
         if known and overwrite and not _belongs(_read_manifest(folder), spec, inputs):
-            for path in folder.iterdir():
-                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            _move_all(folder, Path(tempfile.mkdtemp(prefix=f"{_replaced(folder)}.", dir=folder.parent)))
             known = False
         run = Run(folder, spec, known and _is_done(folder, spec, inputs), inputs, overrides)
         if run.done:  # perhaps stopped before the last line of `finish_run`
             run.path(CHECKPOINT).unlink(missing_ok=True)
         yield run
+
+
+def _replaced(folder: Path) -> str:
+    """How the names of folders begin in which a run waits that another one is to take the place of."""
+    return f".{folder.name}.doedesign-replaced"
+
+
+@contextlib.contextmanager
+def _replaced_or_restored(folder: Path) -> Iterator[None]:
+    """Bring back a run that nothing took the place of: a mistake was found before the other began, or it was killed."""
+
+    def restore() -> None:
+        for aside in folder.parent.glob(f"{glob.escape(_replaced(folder))}.*"):
+            if not (folder / MANIFEST_NAME).is_file():
+                _move_all(aside, folder)
+                aside.rmdir()
+
+    restore()
+    try:
+        yield
+    finally:
+        restore()
+
+
+def _move_all(source: Path, target: Path) -> None:
+    """Move all that is in a folder into another; what says that it is a run goes last."""
+    for path in sorted(source.iterdir(), key=lambda path: path.name == MANIFEST_NAME):
+        path.rename(target / path.name)
 
 
 def _belongs(found: "_Manifest", spec: Spec, inputs: Mapping[str, str]) -> bool:
@@ -280,6 +309,8 @@ def begin_run(run: Run) -> None:
             write_atomic(run.path(name), read_bytes(input_files(run.spec, key)[key]))
     _write_manifest(run, "running", {})
     write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
+    for aside in run.folder.parent.glob(f"{glob.escape(_replaced(run.folder))}.*"):
+        shutil.rmtree(aside)
 
 
 def finish_run(

@@ -690,6 +690,7 @@ def test_the_command_prints_where_the_table_is(run: Path, tmp_path: Path):
     for options, words in (
         (("--table", 3), "must be 1 or 2"),
         (("--pairs", 0), "must be at least 1"),
+        (("--seed", -1), "--seed: must be from 0 to 4294967295"),
         (("--rows", "proposed", "--rows", "mine"), "--rows: must be among proposed, "),
         (("--images", tmp_path), "--test"),
         (("--occlusion", "real"), "must be one of"),

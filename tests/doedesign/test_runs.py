@@ -151,6 +151,28 @@ def test_locks_may_be_missing(run: Run, monkeypatch: pytest.MonkeyPatch):
         pass
 
 
+def test_a_run_comes_back_where_nothing_takes_its_place(done: Run, spec: Spec):
+    """A mistake that is found after it was asked to be overwritten, or a kill, loses nothing."""
+    changed = spec.model_copy(update={"name": "another"})
+    (done.folder / "notes.txt").write_text("mine")
+    before = {path.name for path in done.folder.iterdir()}
+    with pytest.raises(InputError, match="mistake"), claim_run(done.folder, changed, {}, overwrite=True):
+        raise InputError("objective", "mistake", "one", "Correct it.")
+    assert {path.name for path in done.folder.iterdir()} == before
+    # Killed before the other run began.
+    aside = done.folder.parent / f".{done.folder.name}.doedesign-replaced.abcd_123"
+    aside.mkdir()
+    for path in list(done.folder.iterdir()):
+        path.rename(aside / path.name)
+    with claim_run(done.folder, spec, {}) as run:
+        assert run.done
+    assert {path.name for path in done.folder.iterdir()} == before
+    with claim_run(done.folder, changed, {}, overwrite=True) as run:
+        begin_run(run)
+        assert {path.name for path in done.folder.iterdir()} == {"manifest.json", "spec.toml"}
+    assert [path.name for path in done.folder.parent.iterdir() if "replaced" in path.name] == []
+
+
 def test_only_temporary_files_are_cleared_away(run: Run):
     kept = [".gitignore", ".notes.txt.abcdefgh", "checkpoint.npz.abcdefgh", ".height.exr.bak", ".psf.exr"]
     kept += [".checkpoint.npz.original", ".psf.new.abcdefgh"]  # of people

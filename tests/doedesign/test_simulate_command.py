@@ -282,3 +282,10 @@ def test_folders_of_others_are_left_alone(run: Path, images: Path, tmp_path: Pat
     before = content(tmp_path / "mine")
     assert "must belong to this simulation" in refused(*arguments(run, tmp_path / "mine", images, "--seed", 5))
     assert content(tmp_path / "mine") == before
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 40])
+def test_a_seed_that_is_none_is_refused_before_anything_is_written(run: Path, images: Path, tmp_path: Path, seed: int):
+    told = refused(*arguments(run, tmp_path / "out", images, "--seed", seed))
+    assert "--seed: must be from 0 to 4294967295" in told
+    assert not (tmp_path / "out").exists()
