@@ -105,23 +105,22 @@ class GaussianBeam:
         """
         tangents = np.tan(np.add(self.angle_rad, self.tilt_rad))
         along = np.array([*tangents, 1.0]) / np.sqrt(1 + np.sum(tangents**2))  # of the axis (y, x, z)
-        place = np.stack(
-            [grid.axis_m("y")[:, None] + 0 * grid.axis_m("x"), grid.axis_m("x") + 0 * grid.axis_m("y")[:, None]]
-        )
-        place = place - np.array(self.centre_m)[:, None, None]
-        further = np.tensordot(along[:2], place, 1)
+        place = grid.axis_m("y")[:, None] - self.centre_m[0], grid.axis_m("x") - self.centre_m[1]
+
+        def distance(direction: Float[np.ndarray, "3"]) -> Any:
+            """Of every cell along a direction; an upright beam stays a product of two lines."""
+            return sum(float(part) * at for part, at in zip(direction, place, strict=False) if part)
+
         # Two axes across the beam: that of y in the plane of y and the beam, the other normal to both.
-        one = np.array([1.0, 0, 0]) - along[0] * along
-        one = one / np.sqrt(np.sum(one**2))
-        across = one, np.cross(one, along)
-        light: Any = np.sqrt(along[2])  # the footprint is longer by the inverse of its square
-        for axis, number in ((0, self._modes[mode][1]), (1, self._modes[mode][2])):
+        tall = np.array([1.0, 0.0, 0.0]) - along[0] * along
+        tall = tall / np.sqrt(np.sum(tall**2))
+        further, light = distance(along), np.sqrt(along[2])  # the footprint is longer by the inverse of its square
+        for axis, across, number in ((0, tall, self._modes[mode][1]), (1, np.cross(along, tall), self._modes[mode][2])):
             radius, curvature = self._at(axis, wavelength_m, further)
-            at = np.tensordot(across[axis][:2], place, 1)
-            turn = np.arctan((self.waist_distance_m + further) / self._rayleigh_m(axis, wavelength_m))
-            turn = turn - np.arctan(self.waist_distance_m / self._rayleigh_m(axis, wavelength_m))
+            at, rayleigh = distance(across), self._rayleigh_m(axis, wavelength_m)
+            turn = np.arctan((self.waist_distance_m + further) / rayleigh) - np.arctan(self.waist_distance_m / rayleigh)
             waves = curvature * at**2 / 2 / wavelength_m - (number + 0.5) * turn / (2 * np.pi)
-            light = light * _hermite_gaussian(number, at, radius) * np.exp(2j * np.pi * (waves - np.rint(waves)))
+            light = light * (_hermite_gaussian(number, at, radius) * np.exp(2j * np.pi * (waves - np.rint(waves))))
         return light
 
 
@@ -244,8 +243,8 @@ def path_from_point_m(
 
 
 def _hermite_gaussian(
-    number: int, at_m: Float[np.ndarray, "*n"], radius_m: float | Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n"]:
+    number: int, at_m: Float[np.ndarray, "..."], radius_m: float | Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
     """Hermite-Gaussian function of unit norm, 1/sqrt(m), by its recurrence; the lowest has the radius 1/e²."""
     place = np.sqrt(2) * at_m / radius_m
     below, here = np.zeros_like(place), (2 / np.pi) ** 0.25 / np.sqrt(radius_m) * np.exp(-(place**2) / 2)

@@ -19,7 +19,7 @@ class RobustSpec(SpecTable, frozen=True):
     Attributes:
         steps: number of these steps.
         draws: plates that some steps look at before others are drawn: for the "mean" one pair with errors of opposite
-            sign in a step, or else all of them.
+            sign in a step, of 40 plates at most, or else all of them.
         measure: risk that the steps minimise, of the losses of these plates: their "mean"; "cvar", the mean of the
             worst; or "yield", the share of plates whose loss exceeds `limit`, with a soft edge.
         share: share of the plates, the worst ones, that "cvar" looks at.

@@ -119,17 +119,20 @@ class Order:
             return tuple(round(move / self.dbu_m) for move in given)
         if not self.wafer.compensate:
             return (0,) * self.process.masks
+        return edge_moves(self._biases_m, self.dbu_m)
+
+    @property
+    def _biases_m(self) -> list[float]:
+        """How much wider than drawn the process prints, by mask: outward of every edge."""
         usual = self.process.expected()
-        own = usual.cd_bias_m or (0.0,) * self.process.masks
-        return edge_moves([float(usual.common_cd_bias_m + bias) for bias in own], self.dbu_m)
+        return [float(usual.common_cd_bias_m + own) for own in usual.cd_bias_m or (0.0,) * self.process.masks]
 
     def narrowed(self) -> tuple[str, ...]:
         """One sentence for every mask whose moved edges leave a line or a space too narrow for the process to print."""
-        found, usual = [], self.process.expected()
-        own = usual.cd_bias_m or (0.0,) * self.process.masks
+        found, biases_m = [], self._biases_m
         for split in self.splits:
             for mask, (bit, move) in enumerate(zip(split.bits, split.moves, strict=True)):
-                plane, grown_m = self.rules.planes[bit], move * self.dbu_m + usual.common_cd_bias_m + own[mask]
+                plane, grown_m = self.rules.planes[bit], move * self.dbu_m + biases_m[mask]
                 for what, widths, sign in (("line", plane.line, 1), ("space", plane.space, -1)):
                     least = widths.minimum_m
                     if not move or widths.smallest_m is None or widths.smallest_m < least:

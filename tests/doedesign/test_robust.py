@@ -221,6 +221,7 @@ def test_a_stopped_run_goes_on_with_its_plates(spec: Path, tmp_path: Path, monke
     ("change", "words"),
     [
         (["robust.measure=yield"], "needs the loss of a good plate"),
+        ([f"robust.draws={2 * robust_steps.ROUND + 1}"], f'"mean" looks at {2 * robust_steps.ROUND} plates at most'),
         (["robust.draws=0"], "robust.draws"),
         (["robust.share=0.0"], "robust.share"),
         (["optimize.polish=2"], "moves of cells would undo it"),
