@@ -1,7 +1,7 @@
 """A larger aperture whose depth of field the plate buys back: what it is worth behind dirt, measured with its rivals.
 
     python examples/wide_aperture.py [--images DIR ...] [--judged DIR ...] [--behind bars] [--steps 0]
-        [--out runs/wide_aperture]
+        [--classic] [--out runs/wide_aperture]
 
 Four cameras of 16 mm look at scenes from 2 m to infinity through dirt 4 to 6 mm wide, at 5 to 12 cm: stopped down
 to 4.44 mm, at f/2, at f/1.4, and at f/1.4 with the plate of `wide_aperture.toml`. All expose as long, so that the stop
@@ -10,10 +10,11 @@ off, what it keeps back is made up for, and a network gets the result and the sh
 the same network and training, on scenes of random depth that it is not told (it has the PSF of the middle depth),
 judged by PSNR of the covered part at 2 m, 4 m and infinity; the plate as drawn and as fabricated. Beside it stands one
 linear filter for all depths, without training; `--steps 0` has it alone. `--behind bars` has straight bars of 4 mm at
-8 cm, 12 to 16 mm apart, in place of dirt. Written to OUT:
+8 cm, 12 to 16 mm apart, in place of dirt. `--classic` adds cameras with a quartic, a cubic and a logarithmic asphere,
+each at its best strength (`wide_plates.py`). Written to OUT:
 
     design/             the run of the plate
-    plates.json         what one filter for all depths leaves: plain lens, classic plates, the plate
+    classic/            those of classic plates
     CAMERA/             PSFs by parts of the aperture, light of the training scenes, network
     scores.csv          PSNR of every picture, camera, depth and light
     summary.json        means, differences picture by picture with their intervals
@@ -41,6 +42,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import wide_cameras as cameras
+import wide_plates
 from dirty_scenes import DirtyScene, dirty_scenes, light_of
 
 from doedesign.build import camera_from_spec
@@ -48,14 +50,13 @@ from doedesign.capture.from_spec import obstruction_from_spec
 from doedesign.capture.images import Pictures, picture_files, sample_files
 from doedesign.cli import exit_code
 from doedesign.design.design import Design
-from doedesign.design.objectives import PsfSet, filtered_error
 from doedesign.optimization import optimize
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.weights import camera_facts, read_network, write_network
 from doedesign.runs.journal import study_folder
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
-from doedesign.spec import Spec, load_spec, spec_digest
+from doedesign.spec import load_spec, spec_digest
 from doedesign.spec.training import TrainSpec
 from doedesign.training.loss import adam_step, losses
 from doedesign.training.scores import mean_and_interval, paired_difference, psnr
@@ -65,7 +66,6 @@ from fab.figure import SMALL, panels, save
 from fab.files import canonical_json, csv_table, write_atomic
 from sim.light import srgb_from_linear
 from sim.optic import CellOptic, HeightOptic
-from sim.psf_bank import psf
 
 DRAWS = 3  # plates as fabricated
 
@@ -92,6 +92,7 @@ class Plan:
         width: features of the network's finest scale.
         seed: of everything random.
         behind: what all scenes are behind, a key of `BEHIND`.
+        classic: whether classic plates are judged, too.
     """
 
     size: int = 128
@@ -102,6 +103,7 @@ class Plan:
     width: int = 16
     seed: int = 1
     behind: str = "dirt"
+    classic: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what no picture or training comes of."""
@@ -252,58 +254,6 @@ def judge(
     return rows, pictures
 
 
-def classic_plates(design: Design, folder: Path) -> dict[str, Any]:
-    """Errors of one filter for all depths: plain lens, classic plates at their best strength, and the plate; a file."""
-    path = folder / "plates.json"
-    if path.is_file():
-        return json.loads(path.read_text())
-    tries = {
-        "plain": [("flat", {})],
-        "quartic": [("quartic", {"waves": w}) for w in (7.4, 9.0, 12.0, 16.0)],
-        "cubic": [("cubic", {"waves": w}) for w in (8.0, 12.0, 16.0, 24.0)],
-        "logarithmic asphere": [
-            ("logarithmic_asphere", {"near": "2 m", "far": far}) for far in ("5 m", "10 m", "40 m")
-        ],
-    }
-    spec = load_spec(cameras.SPEC)
-    rows = {}
-    for name, starts in tries.items():
-        found = []
-        for start, options in starts:
-            # Zones of the asphere focus from 2 m on, so its lens is focused at infinity; its radii are those of rings.
-            words = ["optimize.steps=0", f'optimize.start="{start}"']
-            words += [] if start != "cubic" else ['optimize.parametrization="freeform"']
-            words += [] if start != "logarithmic_asphere" else ['sensor.defocus="0 um"']
-            own = load_spec(cameras.SPEC, words)
-            own = own.model_copy(
-                update={"optimize": own.optimize.model_copy(update={"start_options": _options(own, options)})}
-            )
-            found.append({"options": options} | errors_of(optimize(own), spec))
-        rows[name] = min(found, key=lambda row: row["worst"])
-    rows["plate"] = errors_of(design, spec)
-    write_atomic(path, canonical_json(rows))
-    return rows
-
-
-def _options(spec: Spec, options: Mapping[str, Any]) -> Any:
-    return type(spec.optimize.start_options)(tuple(sorted(options.items())))
-
-
-def errors_of(design: Design, spec: Spec) -> dict[str, float]:
-    """Mean and worst error of a design, as drawn, for all depths and for every depth's own filter."""
-    camera = replace(design.camera, window=spec.sensor.window)
-    height = design.nominal_height_m
-    far = psf(height, camera, cameras.depths_of(spec)).energy
-    near = jnp.zeros((3, 0, camera.window, camera.window))
-    view = PsfSet(near, jnp.asarray(far), jnp.zeros((3, 0)), jnp.zeros(0), camera)
-    options: dict[str, Any] = dict(spec.objectives[0].options)
-    return {
-        "mean": float(filtered_error(view, **options)),
-        "worst": float(filtered_error(replace(view, worst=True), **options)),
-        "known": float(filtered_error(view, known=True, **options)),
-    }
-
-
 def summary_of(rows: Sequence[Judged]) -> dict[str, Any]:
     """Means by camera, plate, way, light and depth; worst depths; differences of the plate over every rival.
 
@@ -384,23 +334,30 @@ def run(out: Path, plan: Plan, images: Sequence[Path], judged: Sequence[Path]) -
 
 def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
     optimize(cameras.SPEC, out / "design")
-    design = open_design(out / "design")
-    classic_plates(design, out)
+    designs = {"optimised": open_design(out / "design")}
+    kinds = cameras.CAMERAS + (cameras.CLASSIC if plan.classic else ())
+    for kind in kinds:
+        if kind.plate in wide_plates.TRIES:
+            folder = out / "classic" / kind.plate
+            optimize(wide_plates.spec_of(kind.plate, wide_plates.best_start(kind.plate)[1], 0), folder)
+            designs[kind.plate] = open_design(folder)
     training = scenes_of(pools[0], plan, plan.scenes if plan.steps else 0, 0)
     seen = scenes_of(pools[1], plan, plan.judged, 1)
     rows: list[Judged] = []
     shown: dict[str, dict[Any, np.ndarray]] = {}
     edge = 0
-    for kind in cameras.CAMERAS:
+    for kind in kinds:
         folder = out / kind.name
+        design = designs.get(kind.plate)
         drawn = partial(_drawn, kind, design)
         bench = cameras.Bench(kind, plan.size, folder, drawn)
         network = trained(bench, training, plan, folder) if plan.steps else None
         edge = (bench.camera.window - 1) // 2
         found, shown[kind.name] = judge(bench, network, seen, plan, "drawn", (1.0, 0.1), bench)
         rows += found
-        for number in range(DRAWS if kind.plate else 0):
-            made = cameras.Bench(kind, plan.size, folder / f"draw_{number}", partial(_fabricated, kind, design, number))
+        for number in range(DRAWS if kind.plate == "optimised" else 0):
+            make = partial(_fabricated, kind, designs[kind.plate], number)
+            made = cameras.Bench(kind, plan.size, folder / f"draw_{number}", make)
             found, shown["plate, fabricated"] = judge(bench, network, seen, plan, f"fabricated {number}", (1.0,), made)
             rows += found
         write_atomic(out / "scores.csv", csv_table(rows, 6).encode())
@@ -410,9 +367,9 @@ def _run(out: Path, plan: Plan, pools: Sequence[Pictures]) -> dict[str, Any]:
     return found
 
 
-def _drawn(kind: cameras.CameraKind, design: Design) -> CellOptic:
+def _drawn(kind: cameras.CameraKind, design: Design | None) -> CellOptic:
     camera, _ = cameras.camera_of(kind)
-    return HeightOptic.of(camera, design.level_map.height_m if kind.plate else None)
+    return HeightOptic.of(camera, None if design is None else design.level_map.height_m)
 
 
 def _fabricated(kind: cameras.CameraKind, design: Design, number: int) -> CellOptic:
@@ -431,6 +388,7 @@ def main() -> int:
         field = "judged" if name == "judged-scenes" else name
         parser.add_argument(f"--{name}", type=int, default=getattr(Plan(), field), dest=f"plan_{field}")
     parser.add_argument("--behind", choices=sorted(BEHIND), default=Plan().behind, dest="plan_behind")
+    parser.add_argument("--classic", action="store_true", dest="plan_classic", help="judge classic plates, too")
     parser.add_argument("--out", type=Path, default=Path("runs/wide_aperture"))
     given = parser.parse_args()
 

@@ -1,7 +1,7 @@
-"""Four cameras of 16 mm before dirt: their light by parts of the aperture, their sensor and one filter for all depths.
+"""Cameras of 16 mm before dirt: their light by parts of the aperture, their sensor and one filter for all depths.
 
 A part of `wide_aperture.py`: stopped down to 4.44 mm, at f/2, at f/1.4, and at f/1.4 with the plate of
-`wide_aperture.toml`. All expose as long, so that the stop gets 0.15 of the light.
+`wide_aperture.toml`, and with classic plates in its place. All expose as long, so that the stop gets 0.15 of the light.
 """
 
 from dataclasses import replace
@@ -29,27 +29,39 @@ AGAIN = "Remove it; it is computed again."
 
 
 class CameraKind(NamedTuple):
-    """A camera of the comparison: cells over its aperture, parts across, and whether it has the plate."""
+    """A camera of the comparison: cells over its aperture, parts across, and its plate.
+
+    That is "optimised", a start of the optimiser that is a design of its own, or "" for none.
+    """
 
     name: str
     aperture: str
     samples: int
     across: int
-    plate: bool = False
+    plate: str = ""
 
 
 CAMERAS = (
     CameraKind("stop", "4.44 mm", 584, 3),
     CameraKind("f2", "8 mm", 1053, 5),
     CameraKind("open", "11.4 mm", 1500, 7),
-    CameraKind("plate", "11.4 mm", 1500, 7, plate=True),
+    CameraKind("plate", "11.4 mm", 1500, 7, "optimised"),
 )
+# Zones of the asphere focus from 2 m on, so its lens is focused at infinity; the others' is focused at 4 m.
+DEFOCUS = {"logarithmic_asphere": "0 um"}
+CLASSIC = tuple(CameraKind(name, "11.4 mm", 1500, 7, name) for name in ("quartic", "cubic", "logarithmic_asphere"))
 
 
 def camera_of(kind: CameraKind) -> tuple[Camera, Spec]:
     """The lens and sensor of a camera, with an odd window, and its spec."""
-    spec = load_spec(SPEC, [f"doe.samples={kind.samples}", f'doe.aperture="{kind.aperture}"'])
+    words = [f"doe.samples={kind.samples}", f'doe.aperture="{kind.aperture}"', *focus_words(kind.plate)]
+    spec = load_spec(SPEC, words)
     return replace(camera_from_spec(spec), window=spec.sensor.window | 1), spec
+
+
+def focus_words(plate: str) -> list[str]:
+    """Changes to the spec that focus the lens for a plate."""
+    return [f'sensor.defocus="{DEFOCUS[plate]}"'] if plate in DEFOCUS else []
 
 
 def depths_of(spec: Spec) -> tuple[float, ...]:

@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import dirty_scenes  # pyright: ignore[reportMissingImports]
 import wide_aperture  # pyright: ignore[reportMissingImports]
 import wide_cameras  # pyright: ignore[reportMissingImports]
+import wide_plates  # pyright: ignore[reportMissingImports]
 
 
 @pytest.mark.parametrize(("nearest_m", "waves"), [(1.0, 14.8), (2.0, 7.4), (5.0, 3.0)])
@@ -106,21 +107,60 @@ def test_the_spec_says_what_is_designed():
     assert spec.objectives[0].name == "filtered_error"
 
 
-@pytest.mark.study
-def test_the_whole_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """With smaller apertures, few steps and scenes: every table and picture, and the same again from files."""
-    small = (
-        wide_cameras.SPEC.read_text().replace("steps = 1000", "steps = 4").replace("samples = 1500", "samples = 300")
-    )
+@pytest.mark.parametrize("start", wide_plates.TRIES)
+def test_every_try_is_a_spec(start: str):
+    """With its own options, cells or rings as the start needs them, and the lens focused where its zones begin."""
+    for options in wide_plates.TRIES[start]:
+        spec = wide_plates.spec_of(start, options, 7)
+        assert (spec.optimize.start, dict(spec.optimize.start_options), spec.optimize.steps) == (start, options, 7)
+        assert spec.optimize.parametrization == ("freeform" if start == "cubic" else "radial")
+        asphere = start == "logarithmic_asphere"
+        assert (spec.sensor.defocus_m == 0) == asphere
+        kind = wide_cameras.CameraKind(start, "11.4 mm", 1500, 7, start)
+        assert (wide_cameras.camera_of(kind)[0].defocus_m == 0) == asphere
+
+
+@pytest.fixture
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fifth of the aperture and a few steps."""
+    text = wide_cameras.SPEC.read_text().replace("steps = 1000", "steps = 4").replace("samples = 1500", "samples = 300")
     spec = tmp_path / "small.toml"
-    spec.write_text(small.replace('"11.4 mm"', '"2.28 mm"'))
+    spec.write_text(text.replace('"11.4 mm"', '"2.28 mm"'))
     monkeypatch.setattr(wide_cameras, "SPEC", spec)
+
+
+@pytest.mark.slow
+def test_classic_plates_are_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small: None):
+    """Of each kind the strength that leaves least, and what the optimiser makes of it."""
+    tries = {"quartic": [{"waves": 0.0}, {"waves": 9.0}], "cubic": [{"waves": 12.0}]}
+    monkeypatch.setattr(wide_plates, "TRIES", tries)
+    # From 8 cm on, for a fifth of the aperture is out of focus by as many waves at a twenty-fifth of the distance.
+    near = wide_cameras.SPEC.read_text().replace("64.257 um", "1.778 mm")
+    depths = '"2 m", "2.4 m", "3 m", "4 m", "6 m", "12 m", "inf"'
+    wide_cameras.SPEC.write_text(near.replace(depths, '"8 cm", "16 cm", "inf"'))
+    rows = wide_plates.run(tmp_path / "out", 6)
+    assert [(row.start, row.steps) for row in rows] == [(start, steps) for start in tries for steps in (0, 6)]
+    tried = [wide_plates.plate("quartic", options).worst for options in tries["quartic"]]
+    assert rows[0].worst == min(tried) == tried[1] < 0.9 * tried[0]
+    for classic, optimised in zip(rows[::2], rows[1::2], strict=True):
+        assert optimised.worst < classic.worst
+    for row in rows:
+        assert row.mean < row.worst
+        assert row.known < row.worst  # a filter for every depth can do no worse than one for all
+    assert len((tmp_path / "out" / "plates.csv").read_text().splitlines()) == 1 + len(rows)
+    assert wide_plates.run(tmp_path / "out", 6) == rows
+
+
+@pytest.mark.study
+def test_the_whole_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small: None):
+    """With smaller apertures, few steps and scenes: every table and picture, and the same again from files."""
     monkeypatch.setattr(wide_aperture, "DRAWS", 1)
     kinds = (
         wide_cameras.CameraKind("stop", "1.14 mm", 150, 2),
-        wide_cameras.CameraKind("plate", "2.28 mm", 300, 3, True),
+        wide_cameras.CameraKind("plate", "2.28 mm", 300, 3, "optimised"),
     )
     monkeypatch.setattr(wide_cameras, "CAMERAS", kinds)
+    monkeypatch.setattr(wide_cameras, "CLASSIC", (wide_cameras.CameraKind("quartic", "2.28 mm", 300, 3, "quartic"),))
     plan = wide_aperture.Plan(size=48, scenes=2, judged=2, steps=2, width=4)
     files = sample_files()
     found = wide_aperture.run(tmp_path / "out", plan, files[:2], files[2:4])
@@ -131,5 +171,8 @@ def test_the_whole_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert (tmp_path / "out" / "wide_aperture.png").stat().st_size > 10_000
     assert "plate / fabricated 0 / network / 1.0 over stop" in found["worst depth, plate over rival"]
     assert wide_aperture.run(tmp_path / "out", plan, files[:2], files[2:4]) == found
-    alone = wide_aperture.run(tmp_path / "bars", replace(plan, steps=0, behind="bars"), files[:2], files[2:4])
+    alone = wide_aperture.run(
+        tmp_path / "bars", replace(plan, steps=0, behind="bars", classic=True), files[:2], files[2:4]
+    )
     assert all(" / filter / " in name for name in alone["scores"])
+    assert "plate / drawn / filter / 1.0 over quartic" in alone["worst depth, plate over rival"]
