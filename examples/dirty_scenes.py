@@ -51,6 +51,7 @@ class DirtyScene(NamedTuple):
         believed_radiance: `[c]` its light as believed.
         believed_m: its distance as believed.
         covered: `[y, x]` share of every pixel of the picture that is covered, sharp.
+        picture: file name of what lies behind.
         key: of the stream, and its number there.
     """
 
@@ -62,6 +63,7 @@ class DirtyScene(NamedTuple):
     believed_radiance: np.ndarray
     believed_m: float
     covered: np.ndarray
+    picture: str
     key: tuple[int, int]
 
 
@@ -85,7 +87,7 @@ def dirty_scenes(
     errors = DirtErrors()
     for number in range(count):
         rng = np.random.default_rng((*stream, number))
-        _, picture = pictures.following(number)
+        name, picture = pictures.following(number)
         place = (rng.uniform(), rng.uniform())
         background = linear_light(crop(picture, (side, side), place, bool(rng.integers(2))))
         drawn = kind.draw(rng, view, dark)
@@ -115,6 +117,7 @@ def dirty_scenes(
             radiance * np.float32(1 + errors.radiance * signs[2]),
             near_m * distance,
             covered.astype(np.float32),
+            name,
             (stream[1], number),
         )
 

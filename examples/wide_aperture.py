@@ -216,6 +216,7 @@ class Judged(NamedTuple):
     light: float
     depth_m: float
     scene: int
+    picture: str
     psnr: float
 
 
@@ -246,7 +247,8 @@ def judge(
                     found["filter"] = cameras.filtered(seen, bench)
                     for way, picture in found.items():
                         value = float(psnr(picture[None], wanted, scene.covered[None])[0])
-                        rows.append(Judged(bench.kind.name, plate, way, brightness, depth, number, value))
+                        where = depth, number, scene.picture
+                        rows.append(Judged(bench.kind.name, plate, way, brightness, *where, value))
                     if brightness == lights[0]:
                         shots = np.clip(srgb_from_linear(raw), 0, 1), np.clip(next(iter(found.values())), 0, 1)
                         pictures[number, depth] = np.stack(shots)

@@ -86,7 +86,7 @@ def test_a_plan_that_nothing_comes_of_is_refused(wrong: dict[str, Any]):
 def test_plates_as_fabricated_are_judged_together():
     """Picture by picture, over the depths and at the one that is worst for each."""
     rows = [
-        wide_aperture.Judged(camera, plate, "filter", 1.0, depth, scene, psnr + scene)
+        wide_aperture.Judged(camera, plate, "filter", 1.0, depth, scene, f"{scene}.png", psnr + scene)
         for camera, plate, psnrs in (
             ("stop", "drawn", (20.0, 21.0)),
             ("plate", "fabricated 0", (22.0, 22.0)),
