@@ -2,13 +2,14 @@
 
 How much light a DOE can send into spots depends on the phases that they may have among each other, and on nothing else.
 Where spots lie on a lattice of directions, one period of the DOE says all; elsewhere, a few thousand random points
-stand for the cells. All starts take their steps together, as matrix products.
+stand for the cells. All starts take their steps together, as matrix products; on a lattice of many orders axis by axis,
+because a matrix of all spots and points would have gigabytes.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import Staircase, WaveSet, spot_light
@@ -16,6 +17,7 @@ from doedesign.spots.superposition import Staircase, WaveSet, spot_light
 _STEPS = 100
 _POINTS_PER_ORDER, _FEWEST, _SCATTERED = 8, 24, 4096
 _BATCH = 2**24  # values of the starts that are looked at together
+_DENSE = 2**20  # values of a matrix of all spots and points; 11 x 11 orders have fewer
 
 
 class FoundPhases(NamedTuple):
@@ -23,6 +25,55 @@ class FoundPhases(NamedTuple):
 
     waves: list[WaveSet]
     efficiency: float
+
+
+class _Waves(NamedTuple):
+    """Plane waves of all spots at any points."""
+
+    waves: Complex[np.ndarray, "m point"]
+
+    @classmethod
+    def of(cls, spots: Spots, points_m: Float[np.ndarray, "point 2"]) -> "_Waves":
+        return cls(_unit_waves(spots.waves_per_m @ points_m.T))
+
+    def superposition(self, amplitudes: Complex[np.ndarray, "start m"]) -> Complex[np.ndarray, "start point"]:
+        return amplitudes @ self.waves
+
+    def amplitudes(self, field: Complex[np.ndarray, "start point"]) -> Complex[np.ndarray, "start m"]:
+        return field @ self.waves.conj().T
+
+
+class _LatticeWaves(NamedTuple):
+    """The same at the points of a grid, for spots that share few directions along either axis."""
+
+    along_y: Complex[np.ndarray, "row y"]
+    along_x: Complex[np.ndarray, "column x"]
+    places: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]  # row and column of every spot
+
+    @classmethod
+    def of(cls, spots: Spots, points_m: Float[np.ndarray, "point 2"]) -> "_LatticeWaves":
+        assert spots.orders is not None
+        assert spots.lattice_per_m is not None
+        factors, places = [], []
+        for orders, step, points in zip(spots.orders.T, spots.lattice_per_m, points_m.T, strict=True):
+            own, place = np.unique(orders, return_inverse=True)
+            factors.append(_unit_waves(np.outer(own * step, np.unique(points))))
+            places.append(place)
+        return cls(factors[0], factors[1], (places[0], places[1]))
+
+    def superposition(self, amplitudes: Complex[np.ndarray, "start m"]) -> Complex[np.ndarray, "start point"]:
+        lattice = np.zeros((len(amplitudes), len(self.along_y), len(self.along_x)), amplitudes.dtype)
+        lattice[:, *self.places] = amplitudes
+        return (self.along_y.T @ (lattice @ self.along_x)).reshape(len(amplitudes), -1)
+
+    def amplitudes(self, field: Complex[np.ndarray, "start point"]) -> Complex[np.ndarray, "start m"]:
+        rows = self.along_y.conj() @ field.reshape(len(field), self.along_y.shape[1], -1)
+        return (rows @ self.along_x.conj().T)[:, *self.places]
+
+
+def _unit_waves(turns: Float[np.ndarray, "wave point"]) -> Complex[np.ndarray, "wave point"]:
+    # Line by line, for double precision takes several times the memory of what is kept.
+    return np.stack([np.exp(2j * np.pi * (line - np.rint(line))).astype(np.complex64) for line in turns])
 
 
 def search_points(spots: Spots, seed: int, extent_m: tuple[float, float]) -> Float[np.ndarray, "point 2"]:
@@ -57,10 +108,10 @@ def search_phases(
         staircase: levels that the DOE may have; any phase if there is none.
         keep: how many to return.
     """
-    turns = spots.waves_per_m @ points_m.T
-    waves = np.exp(2j * np.pi * (turns - np.rint(turns))).astype(np.complex64)  # [spot, point]
+    on_grid = spots.lattice_per_m is not None and spots.count * len(points_m) > _DENSE
+    waves = (_LatticeWaves if on_grid else _Waves).of(spots, points_m)
     rng, found = np.random.default_rng((seed, 0x57A7)), []
-    batch = max(1, min(starts, _BATCH // waves.shape[1]))
+    batch = max(1, min(starts, _BATCH // len(points_m)))
     for first in range(0, starts, batch):
         count = min(batch, starts - first)
         sets = WaveSet(np.tile(np.sqrt(spots.shares), (count, 1)), rng.uniform(0, 2 * np.pi, (count, spots.count)))
@@ -75,12 +126,10 @@ def search_phases(
     return FoundPhases([each[2] for each in found[:keep]], found[0][1])
 
 
-def _light(
-    sets: WaveSet, waves: Complex[np.ndarray, "m point"], staircase: Staircase | None
-) -> Complex[np.ndarray, "start m"]:
-    field = sets.amplitudes.astype(np.complex64) @ waves
+def _light(sets: WaveSet, waves: _Waves | _LatticeWaves, staircase: Staircase | None) -> Complex[np.ndarray, "start m"]:
+    field = waves.superposition(sets.amplitudes.astype(np.complex64))
     if staircase is None:
         field /= np.maximum(np.abs(field), 1e-12)
     else:
         field = staircase.light[staircase.level(field)]
-    return (field @ waves.conj().T).astype(np.complex128) / waves.shape[1]
+    return waves.amplitudes(field).astype(np.complex128) / field.shape[1]
