@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from doedesign.design.given_wave import WaveShare
-from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
+from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS, open_periods
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
-from fab.aperture import RoundAperture
+from fab.aperture import MaskAperture, RoundAperture
 from fab.grid import Grid
 from fab.units import MILLIMETRES, PlaceUnit
 from sim.camera import Camera
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 # Spot widths from a spot within which light that goes straight on is its light.
 _AT_THE_ZEROTH = 0.5
 _ALL = 0.9995  # of a beam
+_OPEN = 0.999  # of a cell
 _AROUND = 3  # orders beyond the spots among which stray light is looked for
 
 # Efficiency of equal spots by a DOE of any phase: the best that is known, columns by rows.
@@ -215,7 +216,7 @@ def order_table(
         spots: where light should go.
         period_m: side of a unit cell that is repeated, metres. Only whole periods within the aperture, in a square if
             it is round, are looked at, as if there were no end of them: behind a round aperture the feet of bright
-            neighbours add to a peak.
+            neighbours add to a peak, and so they do where a mask closes corners of a rectangle.
         count: columns and rows of a grid of equal spots, for the ceiling.
         levels: levels of the DOE, for the ceiling.
     """
@@ -234,7 +235,7 @@ def order_table(
         field, coverage = field * light, coverage * light
     middle_m = (0.0, 0.0)
     if period_m is not None:
-        field, coverage, grid, middle_m = _whole_periods(field, coverage, camera, period_m)
+        field, coverage, grid, middle_m = _whole_periods(field, coverage, camera, period_m, spots)
     asked = [spots.waves_per_m, np.zeros((1, 2)), *([stray] if len(stray := _stray(spots)) else [])]
     light = peak_amplitudes(field, coverage, grid, np.concatenate(asked)) * np.sqrt(passed)
     found, own_light, given = np.abs(light) ** 2, light[: spots.count], spots.about(middle_m)
@@ -268,14 +269,21 @@ def _in_wave(
 
 
 def _whole_periods(
-    field: Complex[np.ndarray, "y x"], coverage: Float[np.ndarray, "y x"], camera: Camera, period_m: float
+    field: Complex[np.ndarray, "y x"], coverage: Float[np.ndarray, "y x"], camera: Camera, period_m: float, spots: Spots
 ) -> tuple[Complex[np.ndarray, "v u"], Float[np.ndarray, "v u"], Grid, tuple[float, float]]:
     """Field, open share, grid and middle of the whole periods that fit into the opening, or a square in a round one."""
     grid = camera.grid
     period, within = round(period_m / grid.pitch_m), 1.0
+    if isinstance(camera.opening, MaskAperture):
+        assert spots.orders is not None
+        height, width = (period if np.ptp(orders) else 1 for orders in spots.orders.T)
+        whole = open_periods(coverage > _OPEN, (height, width))
+        # Chrome that lies off may leave none whole.
+        whole = whole if whole.any() else coverage > 0
+        return field * whole, coverage * whole, grid, (0.0, 0.0)
     if isinstance(camera.opening, RoundAperture):
         within = np.sqrt(2)
-    open_ = [np.count_nonzero(line > 0.999) for line in (coverage[:, grid.shape[1] // 2], coverage[grid.shape[0] // 2])]
+    open_ = [np.count_nonzero(line > _OPEN) for line in (coverage[:, grid.shape[1] // 2], coverage[grid.shape[0] // 2])]
     height, width = (period * max(1, int(count / within) // period) for count in open_)
     first = [(n - side) // 2 for n, side in zip(grid.shape, (height, width), strict=True)]
     block = tuple(slice(at, at + side) for at, side in zip(first, (height, width), strict=True))

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from doedesign.spec.targets.arrangements import grid_orders, hexagonal_places, ring_places
+from doedesign.spec.targets.spots import open_periods
 from doedesign.spots import search
 from doedesign.spots.exchange import exchange
 from doedesign.spots.orders import ceiling_of, order_table
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, shares_of
 from doedesign.spots.superposition import SpotProblem, Staircase, WaveSet, spot_light
-from fab.aperture import RectangularAperture
+from fab.aperture import MaskAperture, RectangularAperture
 from fab.grid import Grid
 from sim.camera import Camera, Colour
 from sim.optic import HeightOptic
@@ -271,3 +272,27 @@ def test_the_table_of_a_slit_looks_at_all_its_whole_periods(shape):
     assert spots.orders is not None
     found = order_table(HeightOptic.of(slit, height), spots, period_m=8 * PITCH_M)
     np.testing.assert_allclose(found.efficiency, judged(height, slit, spots.orders, 8), rtol=1e-3)
+
+
+def test_the_table_of_a_mask_looks_at_its_whole_periods_alone():
+    """A diamond and a frame around a closed middle, both off the centre: orders are those of the cell alone."""
+    y, x = np.arange(64)[:, None], np.arange(64)
+    frame = np.maximum(abs(y - 34), abs(x - 30))
+    height = np.tile(np.random.default_rng(8).uniform(0, 1e-6, (8, 8)), (8, 8))
+    spots = orders_of((3, 3), 8)
+    assert spots.orders is not None
+    for open_ in (abs(y - 30) + abs(x - 34) < 28, (frame > 12) & (frame < 27)):
+        masked = replace(camera(64), aperture=MaskAperture.of(open_, PITCH_M))
+        found = order_table(HeightOptic.of(masked, height), spots, period_m=8 * PITCH_M)
+        np.testing.assert_allclose(found.efficiency, judged(height, masked, spots.orders, 8), rtol=1e-3)  # as of a slit
+
+
+def test_open_periods_begin_where_most_of_them_fit():
+    cells = np.zeros((7, 9), bool)
+    cells[1:5, 2:9] = True
+    cells[6] = True
+    wanted = np.zeros((7, 9), bool)
+    wanted[1:5, 3:9] = True  # or from 2 to 8
+    np.testing.assert_array_equal(open_periods(cells, (2, 3)), wanted)
+    np.testing.assert_array_equal(open_periods(cells, (7, 9)), np.zeros((7, 9), bool))
+    np.testing.assert_array_equal(open_periods(cells, (1, 1)), cells)

@@ -351,3 +351,11 @@ def test_a_whole_unit_cell_fits_into_the_light(tmp_path: Path, period: str, fits
         return
     with pytest.raises(InputError, match=r"spots\.period: one period at least.*128\.7 um.*got 132 um.*Check the unit"):
         spec_of(tmp_path, f"spots.period={period}")
+
+
+def test_a_whole_unit_cell_fits_into_an_open_part_of_a_mask(tmp_path: Path):
+    """A frame of 192 um whose bars are 40 um wide, 30 um without what the chrome covers."""
+    frame = "doe.aperture={ rows = [[20, 0, 96], [56, 0, 20, 76, 96], [20, 0, 96]] }"
+    assert spec_of(tmp_path, frame, "spots.period=28 um").spots is not None
+    with pytest.raises(InputError, match=r"spots\.period: .*open over one whole period.*got 36 um.*Check the unit"):
+        spec_of(tmp_path, frame, "spots.period=36 um")

@@ -5,15 +5,16 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field, field_validator
 
 from doedesign.spec.targets.arrangements import grid_orders, hexagonal_places, ring_places
 from doedesign.spec.targets.beside import beside_problems, in_focus
 from doedesign.spec.values import PLACE, Count, NotNegative, Positive, bounded, broken, length, place
 from doedesign.spec.values.table import SpecTable, optional, toml_key
-from fab.aperture import RoundAperture
+from fab.aperture import MaskAperture, RoundAperture
 from fab.errors import InputError
+from fab.grid import Grid
 from fab.units import MICROMETRES, MM, UM, format_length
 from sim.illumination import GaussianBeam
 from sim.lens import sines_at
@@ -218,11 +219,38 @@ def _whole_period(spec: "Spec") -> Iterator[InputError]:
     room, where = min(sides), "this aperture"
     if isinstance(opening, RoundAperture):
         room, where = room / math.sqrt(2), "the largest square in this aperture"
+    if isinstance(opening, MaskAperture):
+        side = round(spots.period_m / spec.doe.pitch_m)
+        height, width = (side if count > 1 else 1 for count in reversed(spots.count))
+        if not open_periods(opening.inside(Grid(spec.doe.shape, spec.doe.pitch_m)), (height, width)).any():
+            rule = "the aperture must be open over one whole period at least, or orders count each other's light"
+            cure = "Choose a shorter period or a wider opening. Check the unit."
+            yield InputError("spots.period", rule, format_length(spots.period_m), cure)
+        return
     # A cell of the DOE more or less is of no account.
     if spots.period_m >= room + spec.doe.pitch_m:
         rule = f"one period at least must fit into {where}, {room / UM:.4g} um, or orders count each other's light"
         cure = "Choose a shorter period or a larger aperture. Check the unit."
         yield InputError("spots.period", rule, format_length(spots.period_m), cure)
+
+
+def open_periods(cells: Bool[np.ndarray, "y x"], period: tuple[int, int]) -> Bool[np.ndarray, "y x"]:
+    """Which open cells lie in whole periods that are open; of all places that periods may begin at, the best one.
+
+    Args:
+        cells: which are open.
+        period: cells (y, x) of one period.
+    """
+    (ny, nx), (height, width) = cells.shape, period
+    sums = np.pad(cells.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    within = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    whole = np.zeros((-(-ny // height) * height, -(-nx // width) * width), bool)  # periods that begin at a cell
+    whole[: ny - height + 1, : nx - width + 1] = within == height * width
+    counts = whole.reshape(-1, height, whole.shape[1] // width, width).sum(axis=(0, 2))
+    y, x = np.unravel_index(np.argmax(counts), counts.shape)
+    found = np.zeros((whole.shape[0] + height, whole.shape[1] + width), bool)
+    found[y : y + whole.shape[0], x : x + whole.shape[1]] = np.kron(whole[y::height, x::width], np.ones(period, bool))
+    return found[:ny, :nx]
 
 
 def _apart(spec: "Spec") -> Iterator[InputError]:
