@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.areas.shape import AreaTables
+from doedesign.areas.shape import area_lights
 from doedesign.build import process_from_spec, resolve_process, spec_from_process
 from doedesign.calibration.unknowns import chosen_names
 from doedesign.design.design import Design
@@ -68,7 +68,6 @@ _MASKS, _LIGHT = "precompensation.csv", "precompensation_light.csv"
 _DEPTH_STEP, _EDGE_STEP, _REACH = 0.01, 0.02, 8.0
 _SETTLED = 0.02  # of a step
 _ROOM = 0.9  # of half the narrowest line and space that edges may take, so that nothing closes
-_FAINT = 1e-30
 _TOLD = ("ring_to_disc", "far_spot", "on_target")  # numbers of the light that are logged
 
 
@@ -229,7 +228,7 @@ def precompensate(
 
     Raises:
         InputError: a run that cannot be read, a process of other levels, without errors to make up for or with errors
-            beyond the model, or a folder that belongs to something else.
+            beyond the model, the loss of a spec without objectives, or a folder that belongs to something else.
     """
     if not 0 <= evaluations <= _MOST:
         raise InputError("evaluations", f"must lie from 0 to {_MOST}", evaluations, f"{EVALUATIONS} are usual.")
@@ -248,6 +247,9 @@ def precompensate(
     if folder.resolve() == run.folder.resolve():
         raise InputError(str(folder), "the new run needs a folder of its own", "that of the run", "Give another.")
     files, by = _files(drawn.spec), by or ("loss" if drawn.spec.aims else "psfs")
+    if by == "loss" and not (drawn.spec.objectives or drawn.spec.aims):
+        cure = "Leave it out: plates are then judged by their PSFs."
+        raise InputError("by", "a loss must be that of objectives", "a spec without any", cure)
     about = {
         "run": drawn.spec.name,
         "level_map_sha256": aim.digest,
@@ -306,13 +308,11 @@ def _files(spec: Spec) -> dict[str, Path]:
 
 
 def _loss_of(design: Design, terms: tuple[Term, ...]) -> Callable[[FabricatedDoe], float]:
-    """Loss of a plate: of the terms of a spec, or of its spots, areas or foci, or how far its PSFs are off."""
+    """Loss of a plate: of the terms of a spec, or of its spots, areas or foci."""
     spec, camera, near = design.spec, design.camera, len(design.near_m)
     if spec is not None and spec.aims:
         return partial(_miss, design, spec)
 
-    if not terms:
-        return _difference_from(design)
     lens = participation(jnp.asarray(_energy(design, HeightOptic.of(camera))[:, :near]))
     disc_radius_m = jnp.asarray(disc_radii_m(camera, design.near_m))
 
@@ -336,17 +336,18 @@ def _energy(design: Design, doe: CellOptic) -> Float[np.ndarray, "w d y x"]:
 
 
 def _miss(design: Design, spec: Spec, plate: FabricatedDoe) -> float:
-    """Loss of a plate that should make spots, areas or foci; of several areas that of the worst."""
+    """Loss of a plate that should make spots, areas or foci, as of its design; of several areas that of the worst."""
+    if spec.areas:
+        each = zip(spec.areas, area_lights(design, plate), strict=True)
+        return max(float(light.loss(area.uniformity)) for area, light in each)
     found = on_target(design, plate)
     if isinstance(found, FocusTable):
-        return -float(found.foci.weight @ np.log(found.strength + _FAINT))
-    if isinstance(found, OrderTable):
-        assert spec.spots is not None
-        return spec.spots.uniformity * found.uniformity_error - found.total
-    assert found is not None
-    tables = found.tables if isinstance(found, AreaTables) else (found,)
-    each = zip(spec.areas, tables, strict=True)
-    return max(area.uniformity * table.contrast - table.efficiency for area, table in each)
+        return found.loss
+    assert isinstance(found, OrderTable)
+    assert spec.spots is not None
+    # Where phases are given, light counts in the wave that they make.
+    light = found.total if found.wave is None else found.wave.share
+    return 1.0 - light + spec.spots.uniformity * found.uniformity_error
 
 
 def _compensated(task: _Task, commands: _Commands, name: str) -> Design:

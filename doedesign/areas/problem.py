@@ -40,6 +40,10 @@ class AreaLight(NamedTuple):
     contrast: Float[Array, ""]
     misplaced: Float[Array, ""]
 
+    def loss(self, uniformity: float | Float[Array, ""]) -> Float[Array, ""]:
+        """One less the merit."""
+        return 1.0 - self.efficiency + uniformity * jnp.sqrt(self.contrast**2 + self.misplaced**2)
+
 
 class AreaScore(eqx.Module):
     """How light on a lattice is judged.
@@ -144,8 +148,7 @@ class AreaProblem(eqx.Module):
 
     def loss(self, phase: Float[Array, "y x"], uniformity: float | Float[Array, ""]) -> Float[Array, ""]:
         """One less the merit."""
-        light = self.judge(phase)
-        return 1.0 - light.efficiency + uniformity * jnp.sqrt(light.contrast**2 + light.misplaced**2)
+        return self.judge(phase).loss(uniformity)
 
 
 def _power(field: Array) -> Array:

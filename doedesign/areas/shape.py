@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from doedesign.areas.problem import AreaScore, lattice_factors, mode_fields
+from doedesign.areas.problem import AreaLight, AreaScore, lattice_factors, mode_fields
 from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, colour_number, in_plane
 from doedesign.design.design import Design
 from doedesign.design.given_wave import WaveShare
@@ -245,12 +246,27 @@ class AreaTables:
 
 def areas_of_design(design: Design, doe: CellOptic) -> tuple[AreaTable, ...]:
     """Light on each of the areas of a design's spec, of the design as drawn or as fabricated."""
+    return tuple(area_table(*one) for one in _areas_seen(design, doe))
+
+
+def area_lights(design: Design, doe: CellOptic) -> tuple[AreaLight, ...]:
+    """Light on each of these areas as the loss of the design judges it, on the lattices of `areas_of_design`."""
+    found = []
+    for seen, target, colour in _areas_seen(design, doe):
+        fields, score = _fields_on(seen, target, colour), AreaScore.of(target)
+        given = score.wave is not None  # by one mode
+        found.append(
+            score.judge_field(jnp.asarray(fields[0])) if given else score.judge(jnp.asarray(_light_of(fields)))
+        )
+    return tuple(found)
+
+
+def _areas_seen(design: Design, doe: CellOptic) -> Iterator[tuple[CellOptic, AreaTarget, int]]:
+    """The DOE before the plane of each area, the area, and the number of its colour."""
     assert design.spec is not None
-    tables = []
     for area, target in zip(design.spec.areas, targets_of_design(design), strict=True):
         seen = doe if area.distance_m is None else doe.with_camera(in_plane(area, doe.camera))
-        tables.append(area_table(seen, target, colour_number(area, doe.camera)))
-    return tuple(tables)
+        yield seen, target, colour_number(area, doe.camera)
 
 
 def targets_of_design(design: Design) -> tuple[AreaTarget, ...]:

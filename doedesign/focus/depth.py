@@ -5,11 +5,13 @@ import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from doedesign.design.design import Design
 from doedesign.focus.foci import Foci
+from doedesign.focus.problem import BESIDE, focus_light
 from sim.camera import Camera
 from sim.metrics import zeroth_order
 from sim.optic import CellOptic
@@ -64,6 +66,13 @@ class FocusTable:
     def worst(self) -> float:
         """Largest width over that wanted."""
         return float((self.width_m / self.foci.width_m[:, None]).max())
+
+    @property
+    def loss(self) -> float:
+        """Number that the design makes as small as it can, with the light beside the axis to all four sides."""
+        beside = self.light[:, :, np.isin(np.abs(_PLACES), BESIDE)].reshape(len(self.light), -1)
+        light = self.strength[:, None] * np.concatenate([np.ones((len(beside), 1)), beside], axis=1)
+        return float(focus_light(jnp.asarray(light), jnp.asarray(self.foci.weight)).loss)
 
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""

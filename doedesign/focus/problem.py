@@ -18,7 +18,7 @@ from sim.camera import Camera
 from sim.optic import HeightOptic
 from sim.propagation.near_axis import Octant
 
-_SHARES = (0.0, 0.5, 0.625, 0.75, 0.875, 1.0)  # of the width wanted, for the places beside the axis
+BESIDE = (0.5, 0.625, 0.75, 0.875, 1.0)  # places beside the axis, shares of the width wanted
 _HALF, _SHARP = 0.42, 5000.0  # less than half, so that levels keep it
 _FAINT = 1e-9
 FINER = 3  # rings per cell
@@ -34,6 +34,26 @@ class FocusLight(NamedTuple):
 
     strength: Float[Array, "*any"]
     blur: Float[Array, "*any"]
+
+    @property
+    def loss(self) -> Float[Array, "*any"]:
+        """Number that a design makes as small as it can."""
+        return -jnp.log(self.strength) + _SHARP * self.blur**2
+
+
+def focus_light(light: Float[Array, "focus place *choice"], weight: Float[Array, " focus"]) -> FocusLight:
+    """Strength and blur of the light of foci, of several choices at once.
+
+    Args:
+        light: light on the axis and then beside it, over that of an ideal lens on the axis.
+        weight: share of every focus in the merit.
+    """
+    axis, weight = light[:, :1], weight.reshape(-1, *(1,) * (light.ndim - 2))
+    strength = jnp.exp(jnp.sum(weight * jnp.log(axis[:, 0] + _FAINT), axis=0))
+    excess = jnp.maximum(light[:, 1:] / (axis + _FAINT) - _HALF, 0.0)
+    # Where there is hardly any light on the axis, more beside it says no more.
+    blur = jnp.sqrt(jnp.sum(weight * jnp.mean(jnp.minimum(excess, 3.0) ** 2, axis=1), axis=0) + 1e-12)
+    return FocusLight(strength, blur)
 
 
 class FocusProblem(eqx.Module):
@@ -59,7 +79,7 @@ class FocusProblem(eqx.Module):
         cells = [Octant.of(camera, np.asarray(bare.field(line)), line, pitch / FINER) for line in camera.lines]
         kernels, rates, owners = [], [], []
         for number in range(len(foci.distance_m)):
-            places, distance = np.array(_SHARES) * foci.width_m[number], float(foci.distance_m[number])
+            places, distance = np.array((0.0, *BESIDE)) * foci.width_m[number], float(foci.distance_m[number])
             own = [k for k, line in enumerate(camera.lines) if line.colour == foci.colour[number]]
             whole = sum(camera.lines[k].factor for k in own)
             for k in own:
@@ -88,18 +108,11 @@ class FocusProblem(eqx.Module):
     def judge(self, field: Complex[Array, "part place *choice"]) -> FocusLight:
         """Strength and blur of amplitudes, of several choices at once."""
         light = jax.ops.segment_sum(field.real**2 + field.imag**2, self.focus, len(self.weight))
-        axis = light[:, :1]
-        weight = self.weight.reshape(-1, *(1,) * (light.ndim - 2))
-        strength = jnp.exp(jnp.sum(weight * jnp.log(axis[:, 0] + _FAINT), axis=0))
-        excess = jnp.maximum(light[:, 1:] / (axis + _FAINT) - _HALF, 0.0)
-        # Where there is hardly any light on the axis, more beside it says no more.
-        blur = jnp.sqrt(jnp.sum(weight * jnp.mean(jnp.minimum(excess, 3.0) ** 2, axis=1), axis=0) + 1e-12)
-        return FocusLight(strength, blur)
+        return focus_light(light, self.weight)
 
     def loss(self, field: Complex[Array, "part place *choice"]) -> Float[Array, "*choice"]:
         """Number that a design makes as small as it can."""
-        light = self.judge(field)
-        return -jnp.log(light.strength) + _SHARP * light.blur**2
+        return self.judge(field).loss
 
 
 def ring_count(camera: Camera) -> int:

@@ -1,5 +1,6 @@
 """Foci on the axis: lenses, several foci, colours, an extended depth of focus; refused mistakes, resumed runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ from scipy.special import j0
 
 import doedesign
 import doedesign.optimization as optimization
-from doedesign.focus.depth import focus_of_design
+from doedesign.build import camera_from_spec
+from doedesign.focus.depth import focus_of_design, focus_table
 from doedesign.focus.foci import Foci
 from doedesign.prediction import on_target
 from doedesign.runs.level_maps import open_design
@@ -302,3 +304,18 @@ def test_the_phase_of_a_lens_falls_toward_its_rim(spec_file: Path, tmp_path: Pat
     wanted = -2 * np.pi * (np.hypot(radius, 4e-3) - 4e-3) / 532e-9
     # Levels are a sixteenth of a wave apart, rings of a third of a cell beside the middles of these.
     assert np.abs(along - along.mean() - wanted + wanted.mean()).max() < 0.8
+
+
+def test_light_beside_a_focus_counts_in_its_loss(spec_file: Path):
+    """A quarter of an ideal lens's light on the axis, and as much on three of the four sides."""
+    spec = doedesign.load_spec(spec_file, [])
+    assert spec.focus is not None
+    camera = camera_from_spec(spec)
+    table = focus_table(HeightOptic.of(camera), Foci.shown(spec.focus, camera))
+    narrow = np.exp(-((3 * table.places) ** 2))  # 0.11 of the axis at half the width
+    one_sided = np.where(table.places < 0, narrow, 1.0)
+    table = replace(table, strength=np.array([0.25]), light=np.stack([narrow, narrow])[None])
+    # As much as 0.42 of the axis does no harm.
+    assert table.loss == pytest.approx(np.log(4), abs=0.01)  # 1e-12 of blur, which keeps a root smooth
+    table = replace(table, light=np.stack([np.ones_like(narrow), one_sided])[None])
+    assert table.loss == pytest.approx(np.log(4) + 5000 * 0.75 * 0.58**2, rel=1e-5)  # single precision

@@ -219,6 +219,22 @@ def test_spots_areas_and_foci_judge_a_plate(text: str, changes: list[str], tmp_p
     losses = [loss(plate) for plate in plates]
     assert losses == sorted(losses)
     assert losses[0] < losses[1] - 1e-3
+    if text == AREA:  # on a lattice twice as fine as the design's, whose border is a third of the contrast
+        assert losses[0] == pytest.approx(design.history[-1]["loss"], rel=2e-3)
+
+
+def test_phases_that_are_given_count_in_the_loss(tmp_path: Path):
+    """Two spots of equal light, and the same half a turn apart, whose light is none of the wave."""
+    (tmp_path / "two.toml").write_text(SPOTS)
+    two = "optimize.steps=20", "spots.count=[2, 1]"
+    own, other = (
+        optimize(load_spec(tmp_path / "two.toml", [*two, f'spots.phases=["0 deg", "{turn} deg"]']))
+        for turn in (60, 240)
+    )
+    loss = precompensation._loss_of(own, ())
+    # Both designs have come to rest: single precision.
+    assert loss(own.fabricated(Process(own.levels))) == pytest.approx(own.history[-1]["loss"], abs=1e-6)
+    assert loss(other.fabricated(Process(own.levels))) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_plate_that_was_designed_is_judged_by_its_psfs(tmp_path: Path):
@@ -249,6 +265,10 @@ def test_what_cannot_be_undone_is_said(run: Path, tmp_path: Path, caplog: pytest
         ({"process": "stepper", "evaluations": -1}, "must lie from 0 to"),
         ({"process": Process(Levels(4, 200e-9), spreads={"common_depth_scale": Normal(0.1)})}, "must be for 4 levels"),
         ({"process": "no-such.toml"}, "no-such.toml"),
+        (
+            {"process": Process(Levels(4, 300e-9), spreads={"common_depth_scale": Normal(0.1)}), "by": "loss"},
+            "by: a loss must be that of objectives",
+        ),
     ],
 )
 def test_mistakes_are_told(run: Path, tmp_path: Path, settings: dict[str, object], words: str):
