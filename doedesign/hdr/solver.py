@@ -99,7 +99,7 @@ class LampSolver:
         for number in range(self.rounds if capture.full.any() else 0):
             step, last = problem.step(behind, lamps)
             first = first if number else last
-            lamps = np.where(capture.full, np.maximum(lamps + step, problem.floor), 0).astype(np.float32)
+            lamps = np.where(capture.full, np.maximum(lamps + step, 0), 0).astype(np.float32)
             behind = problem.behind(behind, lamps, _FIXED_POINTS)
         return LampEstimate(_filled(behind + lamps, capture), last / first if first else 1.0)
 
@@ -158,7 +158,6 @@ class _Problem:
     full: Mask
     spread: _Spread
     middle: Float[np.ndarray, "c 1 1"]
-    floor: Picture
     colours: Float[np.ndarray, "c c"]
     apart: tuple[Between, Between]  # whether both neighbours along y and along x are seen
     inner: tuple[Between, Between]  # whether both are full
@@ -175,9 +174,8 @@ class _Problem:
         seen = np.broadcast_to(~full.any(axis=0), light.shape)
         apart = (seen[:, 1:] & seen[:, :-1], seen[:, :, 1:] & seen[:, :, :-1])
         inner = (full[:, 1:] & full[:, :-1], full[:, :, 1:] & full[:, :, :-1])
-        floor = np.zeros_like(light)
         spread = _Spread(psf.astype(np.float32), (light.shape[1], light.shape[2]))
-        return cls(light, full, spread, middle, floor, colours, apart, inner, solver)
+        return cls(light, full, spread, middle, colours, apart, inner, solver)
 
     def behind(self, light: Picture, lamps: Picture, times: int) -> Picture:
         """The scene where it is seen, for lamps of this light."""
