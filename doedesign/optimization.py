@@ -122,17 +122,22 @@ def steps_within(
 ) -> int:
     """Number of steps of a spec that this machine does in a time.
 
-    A few steps are tried to learn how long one takes. A number chosen before is kept, so that a stopped run goes on.
+    A few steps are tried to learn how long one takes, which comes on top of the time.
 
     Args:
         spec: the spec; its own `optimize.steps` does not matter.
-        budget_s: seconds, the compilation of the first step included; robust steps, a descent on levels and the look at
-            the design at the end come on top.
-        out: run folder; where it has a run of this spec with another number of steps, it keeps that one.
+        budget_s: seconds from the beginning of a run to its last step, with the start and the compilation of the first
+            step, or of each colour's where colours are taken in turn; robust steps, a descent on levels, cells that are
+            exchanged and the look at the design at the end come on top.
+        out: run folder; where it has a run of this spec but for the number of steps, that number is returned, so that a
+            stopped run goes on.
         objectives: as in `optimize`.
 
+    Returns:
+        at least 1, however short the time.
+
     Raises:
-        InputError: a time that is not positive, or as `optimize`.
+        InputError: a time that is not positive, nothing to improve, or as `optimize`.
     """
     if not 0 < budget_s < float("inf"):
         raise InputError("budget", "must be positive seconds", budget_s, "For example 60.")
