@@ -51,8 +51,8 @@ def shadow(
     effective_m = depth_m * nearness
     rows, row_edges = _runs(mask, 0)
     runs, column_edges = _runs(rows, 1)
-    # A pixel at u in the picture is at -u depth / focal length in the plane of the obstruction: a lens turns it round.
-    scale_m = camera.pixel_m * depth_m / camera.focal_length_m
+    # A pixel at u in the picture is at -u depth / sensor distance before the lens, which turns the picture round.
+    scale_m = camera.pixel_m * depth_m / camera.sensor_distance_m
     factors = []
     for edges, at, axis in zip((row_edges, column_edges), point, ("y", "x"), strict=True):
         lines_m = -(edges - 0.5 - at) * scale_m

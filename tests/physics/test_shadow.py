@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.reference import YELLOW_M, make_camera
-from sim.camera import Camera
+from sim.camera import Camera, Mapping
 from sim.imaging.shadow import Border, shadow, shadowed_psf
 from sim.psf_bank import psf
 
@@ -115,6 +115,18 @@ def test_light_that_passes_is_what_geometry_leaves_open(pixels: int):
     whole = psf(flat, camera, [np.inf]).energy.sum()
     # Fringes carry light across the edge of the shadow: lambda z / (pi D w) or so of it, 1 % at this Fresnel number.
     assert passed / whole == pytest.approx(disc_overlap(width_m(pixels) / SMALL.aperture_m), abs=0.012)
+
+
+@pytest.mark.parametrize("mapping", ["sine", "tangent"])
+def test_the_sensor_has_its_own_distance(mapping: Mapping):
+    """Focused at 20 cm the sensor lies 4 % farther away, and pixels are so much narrower at the obstruction."""
+    defocus_m = 8e-3**2 / (0.2 - 8e-3)
+    focused = dataclasses.replace(SMALL, defocus_m=defocus_m, mapping=mapping)
+    longer = dataclasses.replace(SMALL, focal_length_m=8e-3 + defocus_m)
+    given = strip(21), NEAR_M, 0.2, YELLOW_M, (50, 50)
+    found, wanted, other = (shadow(camera, *given) for camera in (focused, longer, SMALL))
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    assert np.mean(np.abs(found) ** 2) > np.mean(np.abs(other) ** 2) + 2e-3
 
 
 def test_a_picture_is_the_sum_of_its_points():
