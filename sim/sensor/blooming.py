@@ -20,7 +20,7 @@ def bloomed(signal: Signal, full: "float | Array | np.ndarray", spilled: float) 
 
     Args:
         signal: `[..., y, x]` electrons, or light in any unit, at least 0.
-        full: what a pixel holds, in the same unit.
+        full: what a pixel holds, in the same unit; a number, or an array as `[c, 1, 1]` that goes with the signal.
         spilled: share of the charge beyond it that reaches neighbours instead of a drain, 0 to 1.
 
     Returns:
@@ -34,24 +34,26 @@ def bloomed(signal: Signal, full: "float | Array | np.ndarray", spilled: float) 
         raise InputError("full", "must be positive", str(full), "Give the full well in the unit of the signal.")
     if not 0 <= spilled <= 1:
         raise InputError("spilled", "must lie from 0 to 1", f"{spilled:g}", "0 is for a sensor without blooming.")
-    return _bloomed(jnp.asarray(signal), jnp.asarray(full), jnp.asarray(spilled))
+    signal = jnp.asarray(signal)
+    return _bloomed(signal, jnp.broadcast_to(jnp.asarray(full), signal.shape), jnp.asarray(spilled))
 
 
 @jax.jit
 def _bloomed(signal: Array, full: Array, spilled: Array) -> Array:
     held = jnp.minimum(signal, full)
     half = (signal - held) * spilled / 2
-    return _run(_run(held, half, full)[..., ::-1, :], half[..., ::-1, :], full)[..., ::-1, :]
+    upward = _run(held, half, full)
+    return _run(*(each[..., ::-1, :] for each in (upward, half, full)))[..., ::-1, :]
 
 
 def _run(held: Array, source: Array, full: Array) -> Array:
     """Let charge run toward higher rows: it fills what is free in every pixel that it passes."""
 
-    def pixel(carried: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
-        inside, own = row
-        taken = jnp.minimum(full - inside, carried)
+    def pixel(carried: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        inside, own, room = row
+        taken = jnp.minimum(room - inside, carried)
         return carried - taken + own, inside + taken
 
-    rows = (jnp.moveaxis(held, -2, 0), jnp.moveaxis(source, -2, 0))
+    rows = (jnp.moveaxis(held, -2, 0), jnp.moveaxis(source, -2, 0), jnp.moveaxis(full, -2, 0))
     _, filled = jax.lax.scan(pixel, jnp.zeros_like(rows[0][0]), rows)
     return jnp.moveaxis(filled, 0, -2)

@@ -79,6 +79,19 @@ def test_blooming_keeps_charge_until_columns_end():
     assert found.sum(axis=0) == pytest.approx(signal.sum(axis=0), rel=1e-5)
 
 
+def test_blooming_knows_what_every_pixel_holds():
+    """Colours with full wells of their own are as each for itself; a column fills by what its pixels hold."""
+    signal = np.random.default_rng(2).uniform(0, 3, (3, 20, 4)).astype(np.float32)
+    full = np.array([0.5, 1.0, 2.0], np.float32)
+    found = np.asarray(bloomed(signal, full[:, None, None], 1.0))
+    alone = [np.asarray(bloomed(one, well, 1.0)) for one, well in zip(signal, full.tolist(), strict=True)]
+    np.testing.assert_array_equal(found, alone)
+    wells = np.array([[1.0], [3.0], [2.0], [1.0]])
+    found = bloomed(np.array([[0.0], [0.0], [8.0], [0.0]]), wells, 1.0)
+    # Of six too many three go up, where one fills and the rest runs out, and three down.
+    np.testing.assert_array_equal(found, [[0.0], [3.0], [2.0], [1.0]])
+
+
 def test_blooming_can_be_differentiated():
     signal = np.full((5, 1), 0.5, np.float32)
     signal[2] = 1.6
