@@ -39,6 +39,11 @@ if TYPE_CHECKING:
 _BANK = "psf_bank"
 _DIGEST = "sha256"
 _GUARDED = ("aperture_m", "pitch_m", _BANK)
+# What OpenEXR writes itself: a text of that name fails, or is lost.
+_OPENEXR = (
+    "channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio",
+    "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version",
+)  # fmt: skip
 # A file of a few kilobytes can stand for gigabytes of zeros; one that is large itself may hold more.
 _MOST_VALUES, _MOST_CHANNELS = 1 << 27, 4096
 _SILENT = threading.Lock()
@@ -301,7 +306,7 @@ def _length(path: str | Path, key: str, text: object) -> float:
 def _write(path: Path, channels: Mapping[str, Any], texts: Mapping[str, str], extra: Mapping[str, str] | None) -> None:
     import OpenEXR
 
-    taken = {_DIGEST, *_GUARDED} & (extra or {}).keys()
+    taken = {_DIGEST, *_GUARDED, *_OPENEXR} & (extra or {}).keys()
     if taken:
         raise ValueError(f"extra attributes must have names of their own, but got {sorted(taken)}")
     # OpenEXR takes the memory as it lies, without a look at strides, and refuses float64: hand it contiguous float32

@@ -77,7 +77,7 @@ def test_same_values_same_bytes(tmp_path: Path):
 
 
 def test_taken_names_are_refused(tmp_path: Path):
-    for name in ("pitch_m", "sha256", "psf_bank"):
+    for name in ("pitch_m", "sha256", "psf_bank", "channels", "compression", "version"):  # the last was lost
         with pytest.raises(ValueError, match="names of their own"):
             write_height(tmp_path / "h.exr", heights(), 1e-6, 1e-5, {name: "x"})
 
