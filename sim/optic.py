@@ -245,7 +245,7 @@ class HeightOptic(CellOptic):
         camera: lens, sensor and substrate.
         coverage: `[y, x]` open share of every cell; None where `deviation` has the chrome.
         height_m: `[y, x]` DOE height, metres; None where `deviation` holds all.
-        deviation: of every line, transmission `[y, x]` of a DOE as fabricated over that of its heights, or None. An
+        deviation: by wavelength, transmission `[y, x]` of a DOE as fabricated over that of its heights, or None. An
             array each: out of one for all, a compiled step would copy what it needs.
         source_kind: how sources are described; `SeparableSource` where a compiled step takes many of them.
     """
@@ -253,7 +253,7 @@ class HeightOptic(CellOptic):
     camera: Camera = eqx.field(static=True)
     coverage: Float[Array, "y x"] | None
     height_m: Float[Array, "y x"] | None = None
-    deviation: tuple[Complex[Array, "y x"], ...] | None = None
+    deviation: dict[float, Complex[Array, "y x"]] | None = None
     source_kind: type[SourceMap] | type[SeparableSource] = eqx.field(static=True, default=SourceMap)
 
     @classmethod
@@ -267,7 +267,7 @@ class HeightOptic(CellOptic):
 
     def cells(self, line: SpectralLine, source: CellSource | None = None) -> tuple[Array | None, Array | None]:
         """Heights, and what a DOE as fabricated does besides."""
-        return self.height_m, None if self.deviation is None else self.deviation[self.lines.index(line)]
+        return self.height_m, None if self.deviation is None else self.deviation[line.wavelength_m]
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -296,9 +296,8 @@ class HeightOptic(CellOptic):
 
     def made_as(self, doe: ViewedOptic, height_m: Float[Array, "y x"]) -> "HeightOptic":
         """The same for heights (metres) near these, with all that a DOE made of them does besides, seen from afar."""
-        rates = [self.camera.waves_per_metre(line.wavelength_m) for line in self.lines]
-        pairs = zip(self.lines, rates, strict=True)
-        deviation = tuple(height_deviation(doe.at(line.wavelength_m), height_m, rate) for line, rate in pairs)
+        rates = {wavelength: self.camera.waves_per_metre(wavelength) for wavelength in self.wavelengths_m}
+        deviation = {each: height_deviation(doe.at(each), height_m, rate) for each, rate in rates.items()}
         # The DOE's transmission has the chrome already.
         return replace(self, deviation=deviation, coverage=None)
 

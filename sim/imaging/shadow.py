@@ -97,10 +97,10 @@ def shadowed_psf(
     middle of the window.
     """
     height = jnp.asarray(height_m, jnp.float32)
-    fields = []
-    for line in camera.lines:
-        passed = shadow(camera, mask, depth_m, background_depth_m, line.wavelength_m, point, border)
-        doe = cis(height * jnp.float32(camera.waves_per_metre(line.wavelength_m)))
-        fields.append(jnp.asarray(passed, jnp.complex64) * doe)
-    optic = HeightOptic(camera, HeightOptic.of(camera).coverage, None, tuple(fields))
+    bare, fields = HeightOptic.of(camera), {}
+    for wavelength in bare.wavelengths_m:
+        passed = shadow(camera, mask, depth_m, background_depth_m, wavelength, point, border)
+        doe = cis(height * jnp.float32(camera.waves_per_metre(wavelength)))
+        fields[wavelength] = jnp.asarray(passed, jnp.complex64) * doe
+    optic = HeightOptic(camera, bare.coverage, None, fields)
     return np.asarray(psf(optic, depths=background_depth_m).energy[:, 0])

@@ -80,7 +80,7 @@ def test_a_live_plate_is_quantised_as_it_will_be_drawn() -> None:
 def test_errors_of_nothing_change_nothing() -> None:
     _, plate = live()
     free, rounding, source = radians_of(plate, heights()), ROUNDED, plate.sources(NEAR_M)
-    ones = (jnp.ones((96, 96), jnp.complex64),)
+    ones = {line.wavelength_m: jnp.ones((96, 96), jnp.complex64) for line in plate.optic.lines}
     none = eqx.tree_at(lambda p: p.optic.deviation, plate, ones, is_leaf=lambda x: x is None)
     # A product with one is exact; the compiler may round the two programs' sums apart.
     assert difference(psf_of(none, free, rounding, source), np.asarray(psf_of(plate, free, rounding, source))) < 1e-5

@@ -215,7 +215,7 @@ def test_errors_of_a_process_and_the_perceptual_term() -> None:
     state = made.initial(heights())
     with_errors = [made._with_errors(state, step) for step in (0, 0, 1)]
     optics: list[Any] = [each.doe.optic for each in with_errors]
-    errors = [np.stack(one.deviation) for one in optics]
+    errors = [np.stack(list(one.deviation.values())) for one in optics]
     # Every step has errors of its own, which follow from its number.
     np.testing.assert_array_equal(errors[0], errors[1])
     assert np.mean(errors[0] != errors[2]) > 0.01

@@ -14,6 +14,7 @@ from fab.levels import Levels, height_of, level_map_from_planes, planes
 from fab.process import Disc, MaskDisc, Process, Variation, error_names, variation_of
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
+from sim.optic import HeightOptic
 from sim.propagation.pupil import cis
 from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
@@ -68,6 +69,19 @@ def test_parts_of_a_plate_join_to_the_whole():
     assert made.transmission.shape == whole.shape == (2, *shape)
     # Sums of single precision in another order.
     np.testing.assert_allclose(made.transmission, whole, atol=2e-6)
+
+
+def test_errors_of_a_plate_go_with_their_wavelength(level: np.ndarray):
+    """Before a camera of the same colours in another order, and before one of a single colour."""
+    height_m = LEVELS.heights_m()[level].astype(np.float32)
+    made = plate(level, Variation(common_depth_scale=0.05))
+    optic = HeightOptic.of(CAMERA).made_as(made, jnp.asarray(height_m)).with_heights(jnp.asarray(height_m))
+    wanted = psf(made).energy
+    # Heights are added to the phase and taken away again, in single precision.
+    assert relative_error(psf(optic).energy, wanted) < 1e-4
+    for way in (slice(None, None, -1), slice(1, 2)):
+        other = dataclasses.replace(CAMERA, colours=CAMERA.colours[way])
+        assert relative_error(psf(optic.with_camera(other)).energy, wanted[way]) < 1e-4
 
 
 def expected(height_m: np.ndarray) -> np.ndarray:
