@@ -8,14 +8,24 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 
 import doedesign as dd
 from doedesign.report.page import tiles
-from doedesign.report.page.blocks import BarBlock, ChartBlock, MapBlock, PageContent, PictureBlock, PsfBlock, TableBlock
+from doedesign.report.page.blocks import (
+    BarBlock,
+    ChartBlock,
+    DividerBlock,
+    MapBlock,
+    PageContent,
+    PictureBlock,
+    PsfBlock,
+    TableBlock,
+)
 from doedesign.report.page.compare import compared
-from doedesign.report.page.files import open_files, safe_json
+from doedesign.report.page.files import open_files, picture_image, safe_json
 from doedesign.report.page.gather import gather
 from doedesign.report.page.numbers import LABELS, SHARES
 from doedesign.report.page.reached import asked_block, reached_section
@@ -24,7 +34,7 @@ from doedesign.runs.folder import LEVEL_MAP, load_checkpoint, open_run
 from doedesign.runs.results import results_folder
 from doedesign.spec.models import ObjectiveSpec
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes
+from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file
 from fab.level_map import read_level_map
 from fab.order.write import write_order
 from sim.metrics import METRICS
@@ -309,6 +319,53 @@ def test_results_of_another_form_are_refused(run: Path):
     code, _, told = call("report", run)
     assert code == 2
     assert "small: training: must hold" in told
+
+
+def captured(run: Path) -> dict[str, str]:
+    """Give the run a simulated item as `simulate` writes it; digests of its pictures by kind."""
+    item = run / "simulated" / "0000_cat"
+    item.mkdir(parents=True)
+    for level, kind in enumerate(("conventional", "capture", "clean")):
+        imageio.imwrite(item / f"{kind}.png", np.full((8, 8, 3), 60 * level, np.uint8))
+    digests = {path.name: sha256_file(path) for path in sorted(item.iterdir())}
+    images = {name.removesuffix(".png"): {"file": name} for name in digests}
+    (item / MANIFEST_NAME).write_bytes(canonical_json({"images": images, "sha256": digests}))
+    key = f"{item.name}/{MANIFEST_NAME}"
+    listed = {"format": "doedesign simulation 1", "results_sha256": {key: sha256_file(item / MANIFEST_NAME)}}
+    (item.parent / MANIFEST_NAME).write_bytes(canonical_json(listed))
+    return {name.removesuffix(".png"): digest for name, digest in digests.items()}
+
+
+def test_reconstructions_are_shown_with_their_captures(run: Path):
+    capture, folder = captured(run)["capture"], run.parent.parent / "reconstructed"
+    folder.mkdir()
+    for level, name in enumerate(("cat.png", "cat_beside.png", "dog.png")):
+        imageio.imwrite(folder / name, np.full((8, 8 * (level + 1), 3), 200, np.uint8))
+    record = {
+        name: {"sha256": sha256_file(folder / name), "capture_sha256": of}
+        for name, of in {"cat.png": capture, "cat_beside.png": capture, "dog.png": "another run's"}.items()
+    }
+    (folder / "dog.png").write_bytes(b"changed since")  # which is no picture of this run
+    manifest = folder / MANIFEST_NAME
+    manifest.write_bytes(canonical_json({"format": "doedesign reconstructions 1", "results": record}))
+    ((_, pictures),) = blocks(gather(run), DividerBlock)[0].scenes
+    found = dict(pictures)
+    assert list(found) == ["camera without the plate", "camera with the plate", "reconstruction", "scene"]
+    assert found["reconstruction"] == picture_image(folder / "cat.png", photo=True).source
+    (folder / "cat.png").write_bytes(b"changed since")
+    with pytest.raises(InputError, match="must be the file that the manifest lists"):
+        gather(run)
+
+
+@pytest.mark.parametrize("text", ["no JSON", "[]", '{"results": {"a.png": {}}}', '{"format": "another program"}'])
+def test_what_others_left_in_reconstructed_is_no_part_of_a_run(run: Path, text: str, caplog: pytest.LogCaptureFixture):
+    captured(run)
+    folder = run.parent.parent / "reconstructed"
+    folder.mkdir()
+    (folder / "a.png").write_bytes(b"")
+    (folder / MANIFEST_NAME).write_text(text)
+    assert len(blocks(gather(run), DividerBlock)[0].scenes[0][1]) == 3
+    assert "no reconstructions are shown" in caplog.text
 
 
 def test_no_run_no_page(tmp_path: Path):

@@ -6,12 +6,14 @@ import csv
 import gzip
 import io
 import json
-from collections.abc import Iterator, Mapping
+import logging
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from doedesign.overview.kinds import has_record, record_of
 from doedesign.report.page.blocks import PageImage
 from doedesign.runs.folder import CHECKPOINT, FORMAT, LEVEL_MAP, Run, open_run
 from doedesign.runs.orders import order_of_run
@@ -26,6 +28,7 @@ from fab.pictures import read_display, webp_bytes
 
 _ENDLESS = 1 << 62
 _MOST_PX = 1600  # of a drawn picture; more is not seen on a page
+_log = logging.getLogger("doedesign")
 
 
 class RunFiles(NamedTuple):
@@ -83,8 +86,18 @@ def open_files(folder: Path, order: Path | None = None) -> RunFiles:
             cure = "Give the order of this run, or draw its masks into a folder of their own: doedesign masks RUN."
             raise InputError(str(order), "must be the mask order of this run", "that of another level map", cure)
         read = None
-    reconstructed = next((h / "reconstructed" for h in homes if (h / "reconstructed" / MANIFEST_NAME).is_file()), None)
-    return RunFiles(folder, spec, run, manifest, read, found, reconstructed)
+    return RunFiles(folder, spec, run, manifest, read, found, _reconstructed(homes))
+
+
+def _reconstructed(homes: Sequence[Path]) -> Path | None:
+    """Folder of reconstructions; one that is not this program's or cannot be read is no part of the run."""
+    for folder in (home / "reconstructed" for home in homes):
+        try:
+            if has_record(folder) and record_of(folder).kind == "reconstructions":
+                return folder
+        except InputError as error:
+            _log.warning("no reconstructions are shown: %s", error)
+    return None
 
 
 def digest_of(run: Run) -> str:

@@ -100,7 +100,8 @@ def _divider(files: RunFiles) -> DividerBlock | None:
             _require(item / file, digests[file])
             pictures.append((label, _display(item / file).source))
             if kind == "capture" and (result := made.get(digests[file])) is not None:
-                pictures.append(("reconstruction", _display(result).source))
+                _require(*result)
+                pictures.append(("reconstruction", _display(result[0]).source))
         scenes.append((item.name.partition("_")[2].replace("_", " "), tuple(pictures)))
     if not scenes:
         return None
@@ -114,16 +115,16 @@ def _require(path: Path, digest: str) -> None:
         raise InputError(str(path), "must be the file that the manifest lists", "a changed file", cure)
 
 
-def _reconstructions(files: RunFiles) -> dict[str, Path]:
-    """Reconstructions beside the run by the digest of their capture."""
+def _reconstructions(files: RunFiles) -> dict[str, tuple[Path, str]]:
+    """Reconstructions beside the run, of whatever run, with their digests, by the digest of their capture."""
     if files.reconstructed is None:
         return {}
     results = read_json(files.reconstructed / MANIFEST_NAME).get("results")
-    found = {}
+    found: dict[str, tuple[Path, str]] = {}
     for name, one in sorted(results.items()) if isinstance(results, dict) else ():
         if Path(name).name == name and isinstance(one, dict) and (files.reconstructed / name).is_file():
-            _require(files.reconstructed / name, str(one.get("sha256")))
-            found[str(one.get("capture_sha256"))] = files.reconstructed / name
+            # The first by name is the picture alone, before the one beside its capture.
+            found.setdefault(str(one.get("capture_sha256")), (files.reconstructed / name, str(one.get("sha256"))))
     return found
 
 
