@@ -1,5 +1,6 @@
 """Kinds of folders of results, by what their records say of themselves."""
 
+import os
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ _KINDS = {
     "doedesign reconstructions 1": "reconstructions",
     "doedesign rival training 1": "training of a rival",
 }
+TABLE_NAME = "table.json"  # of an evaluation
 _NAMED = re.compile(r"doedesign (\S.*) \d+")
 _MANY = 1 << 20
 
@@ -41,7 +43,8 @@ class Record(NamedTuple):
 
 def has_record(folder: Path) -> bool:
     """Whether a folder is one of results, finished or not."""
-    return (folder / MANIFEST_NAME).is_file() or (folder / STUDY_NAME).is_file()
+    # Of a folder that must not be read, too, nobody knows of a record.
+    return any(os.path.isfile(folder / name) for name in (MANIFEST_NAME, STUDY_NAME))
 
 
 def record_of(folder: Path) -> Record:
@@ -65,7 +68,7 @@ def record_of(folder: Path) -> Record:
         study = read_json(folder / STUDY_NAME)
         kind = _kind(str(study.get("format"))) or "study"
         # An evaluation has no manifest; its table is written last.
-        done = kind == "evaluation" and (folder / "table.json").is_file()
+        done = kind == "evaluation" and (folder / TABLE_NAME).is_file()
         return Record(kind, str(study.get("design", folder.name)), study, done)
     if not folder.is_dir():
         got = "a file" if folder.exists() else "nothing"

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from doedesign.overview.kinds import Record, has_record, record_of
+from doedesign.overview.kinds import TABLE_NAME, Record, has_record, record_of
 from doedesign.overview.numbers import MainNumber, main_numbers
 from doedesign.runs.costs import Cost, costs_of, together
 from doedesign.runs.folder import CHECKPOINT
@@ -14,7 +14,7 @@ from doedesign.runs.journal import STUDY_NAME
 from doedesign.spec import load_spec
 from fab.archive import read_archive
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, sha256_file
+from fab.files import MANIFEST_NAME, explain_os_error, os_errors_explained, read_json, sha256_file
 
 ROOTS = (Path("runs"), Path("masks"))
 _STEPPED = ("training", "fine-tuning", "training of a rival")
@@ -91,8 +91,12 @@ def _without_record(folder: Path) -> Iterator[Entry]:
     inside = [path for path in _folders_in(folder) if has_record(path)]
     for path in inside:
         yield from _entries(path, 0)
-    if not inside and any(folder.iterdir()):
-        yield Entry(folder, "", folder.name, "not ours", f"no {MANIFEST_NAME}", (), _changed(folder), _size(folder))
+    try:
+        state, about = "not ours" if any(folder.iterdir()) else "", f"no {MANIFEST_NAME}"
+    except OSError as error:
+        state, about = "damaged", _relative(str(explain_os_error(error, folder)), folder)
+    if state and not inside:
+        yield Entry(folder, "", folder.name, state, about, (), _changed(folder), _size(folder))
 
 
 def _entries(folder: Path, depth: int) -> Iterator[Entry]:
@@ -161,16 +165,25 @@ def require_whole(folder: Path, record: Record) -> None:
     Raises:
         InputError: there is such a file.
     """
-    listed = record.found.get("results_sha256", record.found.get("files", {}))
-    if record.kind == "order":
-        listed = {one["file"]: one["sha256"] for one in listed if isinstance(one, dict) and "sha256" in one}
-    if not isinstance(listed, dict):
-        listed = {}
-    for name, digest in listed.items():
-        if not (folder / name).is_file():
-            raise InputError(str(folder / name), "must be there", "no such file", _CURE)
-        if sha256_file(folder / name) != digest:
-            raise InputError(str(folder / name), "must be the file that was written", "a changed file", _CURE)
+    key = "results_sha256" if "results_sha256" in record.found else "files"
+    listed = record.found.get(key, {})
+    if record.kind == "order" and isinstance(listed, list):
+        files = [(one.get("file"), one["sha256"]) for one in listed if isinstance(one, dict) and "sha256" in one]
+    elif isinstance(listed, dict):
+        files = [*listed.items()]
+    else:
+        rule = "must list files with their digests"
+        raise InputError(f"{folder / MANIFEST_NAME}: {key}", rule, type(listed).__name__, _CURE)
+    for name, digest in files:
+        path = folder / str(name)
+        with os_errors_explained(path):
+            there = path.is_file()
+        if not there:
+            raise InputError(str(path), "must be there", "no such file", _CURE)
+        if sha256_file(path) != digest:
+            raise InputError(str(path), "must be the file that was written", "a changed file", _CURE)
+    if record.kind == "evaluation":  # of which nothing lists the digests
+        read_json(folder / TABLE_NAME)
 
 
 def _unfinished(folder: Path, record: Record) -> tuple[str, str]:
@@ -180,11 +193,12 @@ def _unfinished(folder: Path, record: Record) -> tuple[str, str]:
         step = 0
         if (folder / CHECKPOINT).is_file():
             header, _ = read_archive(folder / CHECKPOINT, "checkpoint", _CURE)
-            step = int(header.get("step", 0))
+            step = header.get("step", 0)
         return "stopped", f"at step {step}" + (f" of {steps}" if steps is not None else "")
     if record.kind in _STEPPED:
         done = _lines(folder / "history.jsonl")
-        asked = record.found.get("options", {}).get("steps")
+        options = record.found.get("options")
+        asked = options.get("steps") if isinstance(options, dict) else None
         if asked is None and (folder / "spec.toml").is_file():
             asked = load_spec(folder / "spec.toml").train.steps
         return "stopped", f"at step {done}" + (f" of {asked}" if asked is not None else "")

@@ -4,11 +4,12 @@ A number is what `metrics.json` or another record states, or a plain mean of suc
 key is the one there, and says of a mean which ("near", "far" or none for all).
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from doedesign.overview.kinds import Record
+from doedesign.overview.kinds import TABLE_NAME, Record
 from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
 from fab.errors import InputError
 from fab.files import read_json
@@ -77,9 +78,11 @@ def main_numbers(folder: Path, record: Record) -> tuple[MainNumber, ...]:
     if reader is None:
         return ()
     try:
-        return tuple(reader(folder, record.found))
+        found = tuple(reader(folder, record.found))
+        known = [one.value for one in found if one.value is not None]
+        return found if all(math.isfinite(value) for value in known) else ()
     # A record that another version wrote, or that somebody edited, has not got what is looked for.
-    except (InputError, KeyError, TypeError, ValueError, ZeroDivisionError, AttributeError, IndexError):
+    except (InputError, KeyError, TypeError, ValueError, ArithmeticError, AttributeError, IndexError):
         return ()
 
 
@@ -231,7 +234,7 @@ def _of_model(_: Path, found: Mapping[str, Any]) -> Iterator[MainNumber]:
 
 
 def _of_evaluation(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
-    rows = {row["name"]: row["scores"] for row in read_json(folder / "table.json")["rows"] if row["scores"]}
+    rows = {row["name"]: row["scores"] for row in read_json(folder / TABLE_NAME)["rows"] if row["scores"]}
     for name in (name for name in ("proposed", "capture", "conventional_capture") if name in rows):
         score = rows[name]["occluded"]["psnr"]["mean"]
         label = f"PSNR where it is covered, {name.replace('_', ' ')}"

@@ -28,6 +28,7 @@ from sim.threads import cores
 
 _KIB = 1 if sys.platform == "darwin" else 1024  # what getrusage counts memory in
 _MIB, _GIB = 1 << 20, 1 << 30
+_MOST = 1e18  # seconds or bytes that a command may have taken; no machine has more
 
 
 class Cost(NamedTuple):
@@ -182,7 +183,7 @@ def costs_of(run: Path) -> tuple[Cost, ...]:
 def _cost(line: bytes) -> Cost | None:
     try:
         found: dict[str, Any] = json.loads(line)
-        return Cost(
+        cost = Cost(
             tuple(str(name) for name in found["commands"]),
             float(found["seconds"]),
             float(found["cpu_s"]),
@@ -193,8 +194,10 @@ def _cost(line: bytes) -> Cost | None:
             str(found["ended"]),
             bool(found["done"]),
         )
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
+    numbers = (cost.seconds, cost.cpu_s, cost.peak_bytes, cost.worker_peak_bytes, cost.cores)
+    return cost if all(0 <= number <= _MOST for number in numbers) else None
 
 
 def together(costs: Iterable[Cost]) -> Cost | None:

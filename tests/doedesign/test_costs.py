@@ -1,6 +1,7 @@
 """The cost of commands: kept beside the results, never among them, and never a reason to fail."""
 
 import json
+import math
 import platform
 from pathlib import Path
 
@@ -92,7 +93,11 @@ def test_lines_that_are_none_are_left_out(tmp_path: Path):
     with measured(run, "optimize"):
         (run / "result").touch()
     text = (run / COST_NAME).read_text()
-    (run / COST_NAME).write_text('{"commands": 3}\n[]\nno JSON\n\n' + text + text[:20])
+    lines = ['{"commands": 3}', "[]", "no JSON", "", "[" * 100_000]
+    # Numbers that no sum or text can be made of.
+    lines += [json.dumps(json.loads(text) | {"seconds": value}) for value in (math.nan, math.inf, 1e308, -1.0)]
+    lines += [json.dumps(json.loads(text) | {key: 10**400}) for key in ("cpu_s", "peak_bytes", "cores")]
+    (run / COST_NAME).write_text("\n".join(lines) + "\n" + text + text[:20])
     assert len(costs_of(run)) == 1
 
 

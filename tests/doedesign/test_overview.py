@@ -123,6 +123,57 @@ def test_states_of_folders(tmp_path: Path):
         assert str(tmp_path) not in about  # which stands beside it
 
 
+def test_records_of_another_form_stop_no_list(tmp_path: Path):
+    """Manifests, tables and numbers that were edited: an entry says which file, or has no numbers; none is lost."""
+    written(tmp_path / "whole")
+    for name, record in {
+        "flat": {"format": "doedesign run 1", "results_sha256": True},
+        "long": {"format": "doedesign run 1", "results_sha256": {"a" * 300: "0"}},
+        "order_flat": {"format": "doedesign mask order 2", "files": True},
+        "order_odd": {"format": "doedesign mask order 2", "files": [{"file": [], "sha256": "0"}]},
+        "order_masks": {"format": "doedesign mask order 2", "files": [], "masks": [], "levels": "many"},
+        "trained": {"format": "doedesign training 1", "state": "running", "options": "none"},
+    }.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "manifest.json").write_bytes(canonical_json(record))
+    with_metrics(written(tmp_path / "beyond"), {"psf": [{"throughput": 1e308, "zeroth_order": 0.1}]})
+    study = tmp_path / "study"
+    study.mkdir()
+    (study / "study.json").write_bytes(canonical_json({"format": "doedesign evaluation 1"}))
+    (study / "table.json").write_text('{"rows": [')
+    entries = list_results([tmp_path])
+    found = by_name(entries)
+    assert {name: one.state for name, one in found.items()} == {
+        **dict.fromkeys(("whole", "order_masks", "beyond"), "done"),
+        **dict.fromkeys(("flat", "long", "order_flat", "order_odd", "study"), "damaged"),
+        "trained": "stopped",
+    }
+    assert found["flat"].about.startswith("manifest.json: results_sha256: must list files with their digests")
+    assert found["order_flat"].about.startswith("manifest.json: files: must list files with their digests")
+    assert found["study"].about.startswith("table.json: the file must be JSON")
+    assert [len(found[name].numbers) for name in ("order_masks", "beyond")] == [0, 0]
+    code, said, told = call("runs", tmp_path)
+    assert (code, told) == (0, "")
+    assert len(said.splitlines()) == 1 + len(entries)
+
+
+def test_a_folder_that_must_not_be_read_is_listed_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    written(tmp_path / "run")
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    look = Path.iterdir
+
+    def refused(self: Path):  # whoever runs the tests may be allowed everything
+        if self == closed:
+            raise PermissionError(13, "Permission denied", str(self))
+        return look(self)
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    found = by_name(list_results([tmp_path]))
+    assert {name: one.state for name, one in found.items()} == {"run": "done", "closed": "damaged"}
+    assert "Permission denied" in found["closed"].about
+
+
 def test_results_inside_a_run_are_listed_under_it(tmp_path: Path):
     run = written(tmp_path / "run")
     inside = run / "tolerance"
