@@ -1,6 +1,7 @@
 """Output and exit codes of commands: stdout is data (paths, or JSON on request), stderr is messages."""
 
 import contextlib
+import io
 import json
 import logging
 import os
@@ -49,10 +50,9 @@ def shown_log() -> Iterator[None]:
 
 
 def print_text(text: str) -> None:
-    """Print a result; what the terminal's encoding lacks is escaped."""
-    encoding = sys.stdout.encoding or "utf-8"
+    """Print a result."""
     try:
-        print(printable(text, "\n\t").encode(encoding, "backslashreplace").decode(encoding), flush=True)
+        print(printable(text, "\n\t"), flush=True)
     except OSError as error:
         # What could not be printed would be tried again, and fail again, when Python ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -77,8 +77,11 @@ def exit_code(work: Callable[[], Any], options: Collection[str] = (), given: Col
     `options` are the names of arguments that are options, `given` the words of the command line.
     """
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # whoever started it closed it
+        stream = getattr(sys, name)
+        if stream is None:  # whoever started it closed it
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        elif isinstance(stream, io.TextIOWrapper):  # what its encoding lacks is escaped
+            stream.reconfigure(errors="backslashreplace")
     try:
         with interruptible(), shown_log():
             work()

@@ -191,3 +191,14 @@ def test_a_terminal_gets_a_table_without_markup(tmp_path: Path, monkeypatch: pyt
     assert "[red]run" in shown.getvalue()
     assert "main numbers" in shown.getvalue()
     assert "\t" not in shown.getvalue()
+
+
+def test_a_terminal_without_the_letters_of_a_name_gets_escapes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run = written(tmp_path / "Größe")
+    monkeypatch.setenv("COLUMNS", "300")
+    shown = io.BytesIO()
+    terminal = io.TextIOWrapper(shown, "ascii")
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stdout", terminal)
+    assert main(["runs", str(run)]) == 0
+    assert b"Gr\\xf6\\xdfe" in shown.getvalue()

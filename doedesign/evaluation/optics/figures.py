@@ -77,6 +77,6 @@ def figure(
         for write in writers:
             write(fresh)
         for file, text in tables.items():
-            (fresh / file).write_text(text)
+            (fresh / file).write_bytes(text.encode())
         save(picture, fresh / "figure.png")
     return folder
