@@ -5,12 +5,17 @@ import shlex
 from collections.abc import Callable, Mapping
 from inspect import signature
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 from doedesign.cli.closing import say_closing, words_to_draw
 from doedesign.cli.console import print_paths, print_results, print_text, say
 from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
+
+# Lengths of which the first may be negative: "-1 mm" is no option.
+Place = Annotated[str | None, Parameter(allow_leading_hyphen=True)]
 
 
 def new(name: str | None = None, *, out: Path | None = None, json_: AsJson = False) -> None:
@@ -163,8 +168,8 @@ def masks(
     aperture: str | None = None,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
     probe: str | None = None,
-    patch: str | None = None,
-    mesh_patch: str | None = None,
+    patch: Place = None,
+    mesh_patch: Place = None,
     as_built: Path | None = None,
     order: Path | None = None,
     process: str | None = None,

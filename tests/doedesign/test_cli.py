@@ -18,6 +18,7 @@ from doedesign import __main__ as loading
 from doedesign import __version__
 from doedesign.cli import app, exit_code, main
 from fab.errors import CheckFailed, InputError
+from fab.solids.patch import Patch
 from tests.doedesign.small_runs import call
 
 ROOT = Path(__file__).parents[2]
@@ -181,6 +182,19 @@ def test_json_is_one_line(plate: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert main(draw(plate, tmp_path / "a", "--json")) == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert json.loads(line)["paths"][0] == str(tmp_path / "a")
+
+
+@pytest.mark.parametrize(("option", "step"), [("--patch", True), ("--mesh-patch", False)])
+def test_a_place_may_begin_with_a_minus(plate: Path, option: str, step: bool, monkeypatch: pytest.MonkeyPatch):
+    given: dict[str, object] = {}
+
+    def asked(*_: object, **more: object) -> None:
+        given.update(more)
+        failing_problem()
+
+    monkeypatch.setattr("doedesign.lab.order.write_masks", asked)
+    assert main(["masks", str(plate), option, "-1mm,-20 um,50 um"]) == 2
+    assert given["patch"] == Patch(-1e-3, -20e-6, 50e-6, step=step)
 
 
 def test_warnings_go_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
