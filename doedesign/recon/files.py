@@ -57,8 +57,8 @@ def reconstruct_files(
     Raises:
         InputError: a capture or number that cannot be used, or a folder that holds something else.
     """
-    names = _names(captures, kind)
-    _require_own_folder(folder, captures, names)
+    names = [_with_beside(name, beside) for name in _names(captures, kind)]
+    _require_own_folder(folder, captures, [name for each in names for name in each])
     multiple = model.network.layout.multiple
     try:
         plan_tiles((1, 1), tile, overlap, multiple)
@@ -74,16 +74,12 @@ def reconstruct_files(
     with alone_in(folder):
         # From here on the folder says whose it is, whenever this ends.
         _note(folder, {})
-        for capture, name in zip(captures, names, strict=True):
+        for capture, own in zip(captures, names, strict=True):
             photo = read_capture(capture, linear)
             count = plan_tiles((photo.light.shape[1], photo.light.shape[2]), tile, overlap, multiple).total
-            with meter(f"tiles of {name}", count) as progress:
+            with meter(f"tiles of {own[0]}", count) as progress:
                 found = model.reconstruct(photo, psfs=psfs, tile=tile, overlap=overlap, on_tile=progress.advance)
-            files = [folder / name]
-            found.save(files[0], _bits(photo, files[0].suffix))
-            if beside:
-                files.append(folder / f"{files[0].stem}_beside.png")
-                write_reconstruction(files[1], found.beside(), 8)
+            files = [folder / name for name in own]
             record = {
                 "capture": capture.name,
                 "capture_sha256": sha256_file(capture),
@@ -94,6 +90,11 @@ def reconstruct_files(
                 "tile": tile,
                 "overlap": overlap,
             }
+            # Before they are there, too: what is listed may be replaced, whenever this ends.
+            _note(folder, dict.fromkeys(own, record))
+            found.save(files[0], _bits(photo, files[0].suffix))
+            for path in files[1:]:
+                write_reconstruction(path, found.beside(), 8)
             _note(folder, {each.name: {**record, "sha256": sha256_file(each)} for each in files})
             written += files
     return written
@@ -115,12 +116,24 @@ def _names(captures: Sequence[Path], kind: str | None) -> list[str]:
     return [stem + (ending if ending in WRITTEN_FILES else ".png") for stem, ending in zip(stems, endings, strict=True)]
 
 
+def _with_beside(name: str, beside: bool) -> tuple[str, ...]:
+    """Names of all files of a capture: its reconstruction and, if asked for, both side by side."""
+    return (name, f"{Path(name).stem}_beside.png") if beside else (name,)
+
+
 def _require_own_folder(folder: Path, captures: Sequence[Path], names: Sequence[str]) -> None:
-    """Refuse a folder with anything else in it, or with one of the captures: no other picture is overwritten."""
+    """Refuse names that two results have, and a folder with anything else in it or with one of the captures.
+
+    No other picture is overwritten.
+    """
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        cure = "Reconstruct one of them into another output folder."
+        raise InputError("captures", "must have results of different names", f"{twice} twice", cure)
     if not folder.is_dir():
         return  # `alone_in` makes it, or says why it cannot be made
     content = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-    if content and _results(folder) is None:
+    known = _results(folder)
+    if content and known is None:
         rule = "reconstructions need a folder of their own, new or empty"
         raise InputError(str(folder), rule, "one with other content", "Choose another output folder.")
     given = {real_path(path) for path in captures}
@@ -128,6 +141,9 @@ def _require_own_folder(folder: Path, captures: Sequence[Path], names: Sequence[
         if real_path(folder / name) in given:
             rule, cure = "a capture must not be overwritten", "Choose another output folder."
             raise InputError(str(folder / name), rule, "its own name", cure)
+        if name in content and name not in (known or {}):
+            rule, got = "a picture of another origin must not be overwritten", "a file that the manifest does not list"
+            raise InputError(str(folder / name), rule, got, "Move it, or choose another output folder.")
 
 
 def _results(folder: Path) -> dict[str, Any] | None:

@@ -314,6 +314,40 @@ def test_a_capture_is_never_overwritten(tmp_path: Path, run: Path, capture: Path
     assert first.read_bytes() == whole
 
 
+def test_side_by_side_overwrites_no_other_picture(tmp_path: Path, run: Path, capture: Path):
+    out, own = tmp_path / "out", b"a picture of somebody's own"
+    reconstruct(run, [capture], out)
+    mine = out / "capture_beside.png"
+    mine.write_bytes(own)
+    with pytest.raises(InputError, match="of another origin must not be overwritten"):
+        reconstruct(run, [capture], out, beside=True)
+    shutil.copy(capture, mine.with_suffix(".exr"))
+    with pytest.raises(InputError, match="a capture must not be overwritten"):
+        reconstruct(run, [mine.with_suffix(".exr")], out)
+    twin = Path(shutil.copy(capture, tmp_path / "capture_beside.exr"))
+    how = {"kind": ".png", "beside": True}
+    with pytest.raises(InputError, match=r"results of different names, but got capture_beside\.png twice"):
+        reconstruct(run, [capture, twin], tmp_path / "both", **how)
+    assert mine.read_bytes() == own
+    assert len(reconstruct(run, [capture], tmp_path / "both", **how)) == 2
+    assert len(reconstruct(run, [capture], tmp_path / "both", **how)) == 2  # what is listed is made again
+
+
+def test_a_stopped_call_can_be_repeated(tmp_path: Path, run: Path, capture: Path, monkeypatch: pytest.MonkeyPatch):
+    """Whatever it has written it has listed before."""
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("doedesign.recon.files.write_reconstruction", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(run, [capture], tmp_path / "out", beside=True)
+    assert (tmp_path / "out" / "capture.exr").is_file()
+    assert "sha256" not in read_json(tmp_path / "out" / "manifest.json")["results"]["capture.exr"]
+    assert len(reconstruct(run, [capture], tmp_path / "out", beside=True)) == 2
+
+
 def test_a_result_that_became_a_link_to_itself_is_made_again(tmp_path: Path, run: Path, capture: Path):
     (first,) = reconstruct(run, [capture], tmp_path / "out")
     whole = first.read_bytes()

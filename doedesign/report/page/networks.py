@@ -122,9 +122,11 @@ def _reconstructions(files: RunFiles) -> dict[str, tuple[Path, str]]:
     results = read_json(files.reconstructed / MANIFEST_NAME).get("results")
     found: dict[str, tuple[Path, str]] = {}
     for name, one in sorted(results.items()) if isinstance(results, dict) else ():
-        if Path(name).name == name and isinstance(one, dict) and (files.reconstructed / name).is_file():
+        # Of a picture without a digest the command was stopped.
+        path = files.reconstructed / name
+        if path.name == name and isinstance(one, dict) and "sha256" in one and path.is_file():
             # The first by name is the picture alone, before the one beside its capture.
-            found.setdefault(str(one.get("capture_sha256")), (files.reconstructed / name, str(one.get("sha256"))))
+            found.setdefault(str(one.get("capture_sha256")), (path, str(one["sha256"])))
     return found
 
 
