@@ -2,8 +2,6 @@
 
 import json
 import shlex
-from collections.abc import Callable, Mapping
-from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +9,7 @@ from cyclopts import Parameter
 
 from doedesign.cli.closing import say_closing, words_to_draw
 from doedesign.cli.console import print_paths, print_results, print_text, say
-from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
+from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of, refuse_options
 from fab.errors import InputError
 
 # Lengths of which the first may be negative: "-1 mm" is no option.
@@ -213,13 +211,14 @@ def masks(
         overwrite: Where the folder has the order of another design, replace that order.
     """
     if as_built is not None:
-        fixed = {"--levels": levels, "--step": step, "--etch-depths": etch_depths, "--pitch": pitch, "--scale": scale}
-        fixed |= {"--aperture": aperture, "--wafer": wafer, "--terms": terms, "--probe": probe}
-        _refuse_beside_as_built(fixed, "Leave it out: the order has its own.")
+        fixed: dict[str, object] = {"levels": levels, "step": step, "etch_depths": etch_depths, "pitch": pitch}
+        fixed |= {"scale": scale, "aperture": aperture, "wafer": wafer, "terms": terms, "probe": probe}
+        rule = "does not go with --as-built"
+        refuse_options(masks, fixed, rule, "Leave it out: the order has its own.")
         drawn: dict[str, object] = {"out": out, "patch": patch, "mesh_patch": mesh_patch, "on_violation": on_violation}
         drawn |= {"plates": plates, "mesh_cells": mesh_cells, "direct_write": direct_write}
         drawn |= {"combined_gds": combined_gds, "overwrite": overwrite}
-        _refuse_beside_as_built(_asked(masks, drawn), "Leave it out: nothing is drawn.")
+        refuse_options(masks, drawn, rule, "Leave it out: nothing is drawn.")
         _predict_as_built(source, as_built, order, process, json_)
         return
     if order is not None:
@@ -256,19 +255,6 @@ def masks(
     say(f"{len(done.report.checks)} checks passed: every pixel of every file is {drawn_as(done)}")
     print_results(done.folder, json_, checks=len(done.report.checks))
     say_closing(done.folder, source if source.is_dir() else None, taken)
-
-
-def _asked(command: Callable[..., object], given: Mapping[str, object]) -> dict[str, object]:
-    """Options of a command, by their names, that are not as they are where none is given."""
-    usual = signature(command).parameters
-    return {f"--{name.replace('_', '-')}": value for name, value in given.items() if value != usual[name].default}
-
-
-def _refuse_beside_as_built(options: Mapping[str, object], cure: str) -> None:
-    """Refuse options that would do nothing with --as-built."""
-    for option, given in options.items():
-        if given is not None:
-            raise InputError(option, "does not go with --as-built", str(given), cure)
 
 
 def _predict_as_built(run: Path, sheet: Path, order: Path | None, process: str | None, as_json: bool) -> None:

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from doedesign.cli.closing import say_closing
 from doedesign.cli.console import print_paths, print_results
-from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
+from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of, refuse_options
 from fab.errors import InputError
 
 if TYPE_CHECKING:
@@ -248,6 +248,12 @@ def evaluate(
 
     folder = out or run / "evaluation"
     if figure is not None:
+        idle: dict[str, object] = {"table": table, "rows": rows, "occlusion": occlusion, "obstruction": obstruction}
+        idle |= {"pairs": pairs, "images": images, "test": test, "licence": licence, "train": train, "seeds": seeds}
+        idle |= {"reflect": reflect, "robust": robust, "method": method, "lpips_weights": lpips_weights}
+        idle |= {"workers": workers, "scheduler": scheduler, "set_": set_}
+        cure = "Leave it out: --figure takes --process, --draws, --seed and --out."
+        refuse_options(evaluate, idle, "is of tables and does not go with --figure", cure)
         from doedesign.evaluation.optics.figures import figure as draw
 
         with measured(run, "evaluate", writes=folder) as taken:

@@ -1,6 +1,7 @@
 """Options that several commands share, and how their values are read."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
+from inspect import signature
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -28,6 +29,32 @@ def length_of(option: str, text: str | None) -> float | None:
         raise InputError(option, "must be a length with a unit", f'"{text}"', 'For example "75 nm".') from error
 
 
+def refuse_options(command: Callable[..., object], given: Mapping[str, object], rule: str, cure: str) -> None:
+    """Refuse options that would do nothing.
+
+    Args:
+        command: the function of the command.
+        given: their values by the names of its arguments; one that has its default was not given.
+        rule: why they do nothing.
+        cure: what to do about it.
+
+    Raises:
+        InputError: one of them was given.
+    """
+    usual = signature(command).parameters
+    for name, value in given.items():
+        if value != usual[name].default:
+            word = name.rstrip("_").replace("_", "-")
+            raise InputError(f"--no-{word}" if value is False else f"--{word}", rule, _told(value), cure)
+
+
+def _told(value: object) -> str:
+    """A value of an option in words; of a flag that it is there."""
+    if isinstance(value, bool):
+        return "the option"
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
 # What the library calls in its own words is an option here.
 _PLACES = {
     "captures": "CAPTURE",
@@ -39,6 +66,7 @@ _PLACES = {
     "formats: mesh_cells": "--mesh-cells",
     "etch_depths_m": "--etch-depths",
     "pitch_m": "--pitch",
+    "pixel_m": "--pixel",
     "scale_m": "--scale",
     "aperture_m": "--aperture",
     "tile, overlap": "--tile, --overlap",

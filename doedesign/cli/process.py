@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from doedesign.cli.closing import say_closing
 from doedesign.cli.console import print_results, print_text
-from doedesign.cli.options import AsJson, Flag, Texts, length_of
+from doedesign.cli.options import AsJson, Flag, Texts, length_of, refuse_options
 from fab.errors import InputError
 
 
@@ -62,6 +62,9 @@ def tolerance(
             raise InputError(option, f"must {needs}", "a value", "Leave it out, or change the other.")
     settings: dict[str, Any] = {"process": process, "limits": limit or None, "seed": seed, "masks": masks}
     if draw is not None:
+        idle: dict[str, object] = {"draws": draws, "sensitivity": sensitivity, "limit": limit, "workers": workers}
+        cure = "Leave it out: a single plate takes --seed, --process, --masks and --scheduler."
+        refuse_options(tolerance, idle | {"out": out}, "must be left out with --draw", cure)
         print_text(_one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
         return
     from doedesign.runs.costs import measured
@@ -151,6 +154,10 @@ def calibrate(
     from doedesign.runs.costs import measured
 
     if measurement is not None:
+        of_ratio: dict[str, object] = {"throughput": throughput, "throughput_sigma": throughput_sigma, "probe": probe}
+        of_ratio |= {"depth": depth, "pairs": pairs, "reach": reach}
+        cure = "Leave it out: a measurement takes --errors, --process, --masks, --evaluations, --polish and --seed."
+        refuse_options(calibrate, of_ratio, "goes with --ring-to-disc and not with a measurement", cure)
         from doedesign.calibration.estimate import calibrate as fit
 
         folder = out or run / "calibration"
@@ -161,6 +168,14 @@ def calibrate(
         print_results(folder, json_, estimate=estimate, explained=result.explained)
         say_closing(folder, run, taken)
         return
+    of_search: dict[str, object] = {"evaluations": evaluations, "polish": polish, "seed": seed}
+    cure = (
+        "Leave it out: a ratio takes --errors, --process, --masks, --probe, --depth, --throughput, --pairs and --reach."
+    )
+    refuse_options(calibrate, of_search, "goes with a measurement and not with --ring-to-disc", cure)
+    if throughput is None:
+        idle: dict[str, object] = {"throughput_sigma": throughput_sigma}
+        refuse_options(calibrate, idle, "must be given with --throughput", "Add it, or leave this out.")
     from doedesign.calibration.explanations import Targets, explain_ratio
 
     lengths = {}

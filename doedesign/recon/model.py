@@ -166,13 +166,16 @@ class Model:
         Args:
             files: one bank, or two files, of the scene and of the obstruction. A file of another program (channels R,
                 G, B, or one) is taken as measured, and scaled to the energy of the model's own PSF.
-            pixel_m: pixel pitch of measured PSFs, metres.
+            pixel_m: pixel pitch of measured PSFs, metres; only with files.
             near_m: distance of the obstruction; the middle, in 1/z, of what the network was trained on if None.
             far_m: distance of the scene; what the network was trained for, or the farthest of other PSFs if None.
 
         Raises:
             InputError: files that cannot be used, or a depth beyond a bank's.
         """
+        if pixel_m is not None and not files:
+            rule, cure = "goes with PSFs of another program", "Give their files, too, or leave it out."
+            raise InputError("pixel_m", rule, "the model's own PSFs", cure)
         near_m = middle_depth_m(self.near_m) if near_m is None else near_m
         if not files:
             own_m = next((z for z in (far_m, self.far_m) if z is not None), max(self.bank.depths_m))

@@ -114,6 +114,17 @@ def test_closed_streams_are_nothing_to_stumble_over(tmp_path: Path, closed: str)
     [
         (("psf", "run", "--draw", "normal/3"), "--draw: must be given with --seed"),
         (("simulate", "run", "--draw", "normal/3"), "--draw: must be given with --plate-seed"),
+        (("evaluate", "run", "--figure", "4", "--table", "1"), "--table: is of tables"),
+        (("evaluate", "run", "--figure", "4", "--train"), "--train: is of tables"),
+        (("evaluate", "run", "--figure", "4", "--set", "train.steps=1"), "--set: is of tables"),
+        (("evaluate", "run", "--figure", "8", "--lpips-weights", "a.npz"), "--lpips-weights: is of tables"),
+        (("report", "run", "--compare", "other", "--order", "masks"), "--order: does not go with other runs"),
+        (("calibrate", "run", "m.toml", "--throughput", "0.9"), "--throughput: goes with --ring-to-disc"),
+        (("calibrate", "run", "m.toml", "--no-pairs"), "--no-pairs: goes with --ring-to-disc"),
+        (("calibrate", "run", "--ring-to-disc", "1", "--polish", "3"), "--polish: goes with a measurement"),
+        (("calibrate", "run", "--ring-to-disc", "1", "--throughput-sigma", "0.1"), "must be given with --throughput"),
+        (("tolerance", "run", "--draw", "normal/3", "--draws", "5"), "--draws: must be left out with --draw"),
+        (("tolerance", "run", "--draw", "normal/3", "--out", "there"), "--out: must be left out with --draw"),
     ],
 )
 def test_options_that_would_do_nothing_are_refused(command: tuple[str, ...], words: str):

@@ -245,6 +245,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
         "foreign": ("pixel pitch of a PSF from another program must be given", psf("far.exr", "far.exr")),
         "single": ("are needed, but got one depth", psf("far.exr", pixel_m=PIXEL)),
         "measured pitch": ("pixels that the network was trained with", psf("far.exr", "far.exr", pixel_m=4e-6)),
+        "pitch alone": ("pixel_m: goes with PSFs of another program", {"pixel_m": PIXEL}),
         "dark": ("a PSF must hold light", psf("dark.exr", "dark.exr", pixel_m=PIXEL)),
         "three": ("must be one bank, or one file of the scene", psf("far.exr", "far.exr", "far.exr")),
         "no psf": ("must exist", psf("none.exr")),

@@ -33,7 +33,8 @@ def write_report(
     Args:
         run: the run folder, finished or at work; an open run or a design stands for its folder.
         compare: other runs to put beside it.
-        order: its mask order; `masks/NAME` beside the folder of runs, or where the program runs, by default.
+        order: its mask order; `masks/NAME` beside the folder of runs, or where the program runs, by default. Not with
+            other runs, whose page shows none.
         out: the file; report.html in the run's folder by default, comparison.html for several runs.
 
     Returns:
@@ -41,8 +42,11 @@ def write_report(
 
     Raises:
         InputError: a design without a folder; something that is damaged, was changed, or does not belong to the run;
-            `out` is another file than an earlier page.
+            `out` is another file than an earlier page; an order beside other runs.
     """
+    if compare and order is not None:
+        cure = "Leave it out: a comparison shows no order."
+        raise InputError("order", "does not go with other runs to compare with", str(order), cure)
     folder, others = _folder_of(run), [_folder_of(one) for one in compare]
     path = Path(out) if out is not None else folder / ("comparison.html" if others else "report.html")
     if path.is_file() and not _is_page(path):
