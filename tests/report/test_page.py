@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 import shutil
 from html import unescape
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import doedesign as dd
+import sim
 from doedesign.report.page import tiles
 from doedesign.report.page.blocks import (
     BarBlock,
@@ -79,8 +81,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run with PSFs and a tolerance study."""
     run = made(tmp_path_factory.mktemp("page"), SPREAD)
     design = dd.open_design(run, False)
-    import sim
-
     with results_folder(run / "psf", "small", run) as folder:
         assert folder is not None
         write_bank(folder / "quantised.exr", sim.psf(design, depths=["6 mm", "inf"]))
@@ -366,6 +366,64 @@ def test_what_others_left_in_reconstructed_is_no_part_of_a_run(run: Path, text: 
     (folder / MANIFEST_NAME).write_text(text)
     assert len(blocks(gather(run), DividerBlock)[0].scenes[0][1]) == 3
     assert "no reconstructions are shown" in caplog.text
+
+
+def repeated(run: Path) -> list[str]:
+    """The commands of a page that make its run and its results again."""
+    text = unescape(dd.write_report(run).read_text())
+    found = re.findall(r"^.*?(doedesign [a-z]+ .*?)(?:</pre>)?$", text, re.MULTILINE)
+    return [line for line in found if "runs/small" in line]
+
+
+def test_psfs_off_the_axis_are_told_as_such(run: Path, tmp_path: Path):
+    bank = sim.psf(dd.open_design(run, False), depths=["6 mm", "inf"], field_rad=(math.radians(1), math.radians(-2)))
+    with results_folder(run / "psf", "small", run) as folder:
+        assert folder is not None
+        write_bank(folder / "quantised.exr", bank)
+    ((label,),) = [block.banks for block in blocks(gather(run), PsfBlock)]
+    assert label == "as drawn, field angle 1° along y, -2° along x"
+    assert f"Off the axis: {label}." in blocks(gather(run), PsfBlock)[0].note
+    assert "doedesign psf runs/small --field-deg 1 -2" in repeated(run)
+    again, other = (Path(shutil.copytree(run, tmp_path / name)) for name in ("again", "other"))
+    with results_folder(other / "psf", "small", other) as folder:
+        assert folder is not None
+        write_bank(folder / "quantised.exr", sim.PsfBank(bank.energy, bank.colours, bank.depths_m, bank.pixel_m))
+    assert [len(blocks(compared([run, one]), PsfBlock)) for one in (again, other)] == [1, 0]
+
+
+def test_commands_to_repeat_a_run_have_their_options(run: Path):
+    """Those that results tell of."""
+    plan = {"draws": 8, "wanted": 0.8, "sensitivity": "sobol", "sobol": 32, "corners": True, "budget": "overlay_x"}
+    write_study(run, STUDY | {"plan": plan})
+    with results_folder(run / "fabricated", "small", run, plate="draw normal/3 of seed 7 of the process small"):
+        pass
+    with results_folder(run / "explanations", "small", run) as folder:
+        assert folder is not None
+        targets = {"wavelength_m": 520e-9, "depth_m": 0.1, "ring_to_disc": 1.2}
+        targets |= {"throughput": 0.86, "throughput_sigma": 0.02}
+        (folder / "explanations.json").write_bytes(canonical_json({"targets": targets, "reach": 4.0}))
+    captured(run)
+    assert repeated(run) == [
+        "doedesign optimize spec.toml --out runs/small",
+        "doedesign psf runs/small",
+        "doedesign psf runs/small --fabricated --seed 7 --draw normal/3",
+        "doedesign tolerance runs/small --draws 8 --seed 0 --sensitivity sobol --sobol 32 --corners --budget overlay_x "
+        "--yield 0.8 --limit 'strehl >= 0.9'",
+        "doedesign simulate runs/small",
+        "doedesign calibrate runs/small --ring-to-disc 1.2 --probe '520 nm' --depth '100 mm' --throughput 0.86 "
+        "--throughput-sigma 0.02 --reach 4",
+        "doedesign report runs/small",
+    ]
+    with results_folder(run / "fabricated", "small", run, plate="errors of my plate.toml"):
+        pass
+    assert "doedesign psf runs/small --fabricated --variation 'my plate.toml'" in repeated(run)
+
+
+def test_a_command_on_the_page_can_be_pasted(run: Path, tmp_path: Path):
+    shutil.rmtree(run / "psf")
+    named = Path(shutil.copytree(run, tmp_path / "runs" / "my run"))
+    notes = [block.note for block in blocks(gather(named), PictureBlock) if block.title == "PSFs"]
+    assert notes == ["To look through depths and colours: doedesign psf 'runs/my run', and this report again."]
 
 
 def test_no_run_no_page(tmp_path: Path):

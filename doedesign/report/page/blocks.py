@@ -62,25 +62,22 @@ class TextBlock:
 
 @dataclass(frozen=True)
 class CommandBlock:
-    """Commands that make a run and its results again; their options stand in the template, texts are quoted.
+    """Commands that make a run and its results again; the template writes their options, texts are quoted.
 
     Attributes:
         title: of the block.
         run: the run folder.
         order: the folder of its mask order; None without one.
         changes: changes of the spec.
-        results: folders of results in the run.
-        draws: number of draws and seed of its tolerance study.
-        ratio: ring:disc ratio, wavelength and depth of its explanations.
+        results: folders of results in the run, each with the options of its command, as far as they are known: name
+            and value, which is empty of an option without one.
     """
 
     title: str
     run: str
     order: str | None
     changes: tuple[str, ...]
-    results: tuple[str, ...]
-    draws: tuple[int, int] | None
-    ratio: tuple[str, str, str] | None
+    results: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
     kind: ClassVar[str] = "commands"
 
 

@@ -10,7 +10,7 @@ from doedesign.report.page.files import RunFiles, history_of, listed_bytes, list
 from doedesign.report.page.gather import facts_of
 from doedesign.report.page.maps import difference_block, height_block
 from doedesign.report.page.numbers import label_of, length, number, rounded, value_of
-from doedesign.report.page.psfs import compared_psfs
+from doedesign.report.page.psfs import compared_psfs, with_field
 from doedesign.report.page.reached import asked_block
 from doedesign.runs.folder import LEVEL_MAP
 from doedesign.spec import spec_to_json
@@ -154,7 +154,8 @@ def _maps(names: Sequence[str], runs: Sequence[RunFiles]) -> Iterator[PageBlock]
 def _banks(names: Sequence[str], runs: Sequence[RunFiles]) -> Iterator[tuple[str, Any]]:
     for name, one in zip(names, runs, strict=True):
         if listed_bytes(one.folder / "psf", "quantised.exr") is not None:
-            yield name, read_stored_bank(one.folder / "psf" / "quantised.exr")
+            bank = read_stored_bank(one.folder / "psf" / "quantised.exr")
+            yield with_field(name, bank), bank
 
 
 def _losses(names: Sequence[str], runs: Sequence[RunFiles]) -> ChartBlock | None:

@@ -1,6 +1,7 @@
 """Light of a run: PSFs to look through, orders, metrics through depths, energy and error budget, certificate."""
 
 import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -49,7 +50,8 @@ def light_section(files: RunFiles, metrics: Mapping[str, Any]) -> PageSection | 
     if blocks[0] is None:
         picture = listed_picture(files.folder, "psf.png", photo=True)
         if picture is not None:
-            note = f"To look through depths and colours: doedesign psf {files.folder.name}, and this report again."
+            command = shlex.join(["doedesign", "psf", f"runs/{files.folder.name}"])
+            note = f"To look through depths and colours: {command}, and this report again."
             blocks.append(PictureBlock("PSFs", "PSFs by depth and colour", picture, note, ink=False))
     blocks += [*_orders(files, metrics), *_curves(files), *_through_focus(metrics)]
     return section("light", "Light", [*blocks, *_tables(metrics)])

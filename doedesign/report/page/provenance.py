@@ -1,16 +1,22 @@
 """Versions, digests and the commands that make a run again."""
 
+import math
+import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from doedesign import __version__
 from doedesign.report.page.blocks import CommandBlock, PageBlock, PageSection, TableBlock, TextBlock, section
-from doedesign.report.page.files import RunFiles, listed_json
+from doedesign.report.page.files import RunFiles, listed_bytes, listed_json
 from fab.files import MANIFEST_NAME, read_bytes, read_json
 from fab.units import format_length
+from sim.store import read_stored_bank
 
+Options = tuple[tuple[str, str], ...]  # names and values, quoted
+
+_FIRST_DRAW = "normal/0"  # which a command takes where none is asked for
 # Folders of results, in the order of the work.
 _RESULTS = (
     "psf",
@@ -67,24 +73,89 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 def _commands(files: RunFiles) -> CommandBlock:
     """Commands from the spec to all that the page shows, as far as results tell what was asked."""
     overrides = files.manifest.get("overrides")
-    study = listed_json(files.folder / "tolerance", "results.json")
-    explained = listed_json(files.folder / "explanations", "explanations.json")
-    targets = None if explained is None else explained["targets"]
+    there = [name for name in _RESULTS if _is_there(files.folder / name)]
     return CommandBlock(
         title="Commands to repeat it",
         run=shlex.quote(f"runs/{files.name}"),
         order=None if files.order is None else shlex.quote(f"masks/{files.name}"),
         changes=tuple(shlex.quote(str(one)) for one in (overrides if isinstance(overrides, list) else ())),
-        results=tuple(name for name in _RESULTS if _is_there(files.folder / name)),
-        draws=None if study is None else (study["plan"]["draws"], study["seed"]),
-        ratio=None
-        if targets is None
-        else (
-            f"{targets['ring_to_disc']:g}",
-            shlex.quote(format_length(targets["wavelength_m"])),
-            shlex.quote(format_length(targets["depth_m"])),
-        ),
+        results=tuple((name, _OPTIONS[name](files) if name in _OPTIONS else ()) for name in there),
     )
+
+
+def _of_psf(files: RunFiles) -> Options:
+    """Depths other than those of the spec, and a field off the axis."""
+    if listed_bytes(files.folder / "psf", "quantised.exr") is None:
+        return ()
+    bank, scene = read_stored_bank(files.folder / "psf" / "quantised.exr"), files.spec.scene
+    usual = tuple(dict.fromkeys((*scene.near_m, *scene.far_m)))
+    depths = () if set(bank.depths_m) == set(usual) else tuple(("depths", _length(z)) for z in bank.depths_m)
+    angles = " ".join(f"{math.degrees(angle):.12g}" for angle in bank.field_rad)
+    return (*depths, *((("field-deg", angles),) if any(bank.field_rad) else ()))
+
+
+def _of_fabricated(files: RunFiles) -> Options:
+    """Where the errors of the plate come from, as its manifest says it in words (`Design.plate_errors`)."""
+    words = str(_manifest_of(files.folder / "fabricated").get("plate"))
+    if drawn := re.match(r"draw (\S+) of seed (\d+) of the process ", words):
+        return ("seed", drawn[2]), *((("draw", drawn[1]),) if drawn[1] != _FIRST_DRAW else ())
+    given = words.removeprefix("errors of ")
+    return () if given == words else (("variation", shlex.quote(given)),)
+
+
+def _of_tolerance(files: RunFiles) -> Options:
+    study = listed_json(files.folder / "tolerance", "results.json")
+    if study is None:
+        return ()
+    plan, found = study["plan"], [("draws", str(study["plan"]["draws"])), ("seed", str(study["seed"]))]
+    if plan.get("sensitivity") not in (None, "one_at_a_time"):
+        found.append(("sensitivity", plan["sensitivity"]))
+    if plan.get("sensitivity") == "sobol":
+        found.append(("sobol", str(plan["sobol"])))
+    if plan.get("corners"):
+        found.append(("corners", ""))
+    if plan.get("budget"):
+        found += [("budget", shlex.quote(plan["budget"])), ("yield", f"{plan['wanted']:g}")]
+    limits = (study["plates"].get("yield") or {}).get("limits", ())
+    return *found, *(("limit", shlex.quote(one["limit"])) for one in limits)
+
+
+def _of_simulated(files: RunFiles) -> Options:
+    record = _manifest_of(files.folder / "simulated")
+    found = [(key, shlex.quote(str(record[key]))) for key in ("occlusion", "seed") if key in record]
+    return tuple([*found, *((("png", ""),) if "PNG" in str(record.get("image_files")) else ())])
+
+
+def _of_explanations(files: RunFiles) -> Options:
+    record = listed_json(files.folder / "explanations", "explanations.json")
+    if record is None:
+        return ()
+    targets = record["targets"]
+    found = [
+        ("ring-to-disc", f"{targets['ring_to_disc']:g}"),
+        ("probe", _length(targets["wavelength_m"])),
+        ("depth", _length(targets["depth_m"])),
+    ]
+    if targets.get("throughput") is not None:
+        found += [(key.replace("_", "-"), f"{targets[key]:g}") for key in ("throughput", "throughput_sigma")]
+    return *found, ("reach", f"{record['reach']:g}")
+
+
+def _manifest_of(folder: Path) -> Mapping[str, Any]:
+    return read_json(folder / MANIFEST_NAME) if (folder / MANIFEST_NAME).is_file() else {}
+
+
+def _length(value_m: float) -> str:
+    return "inf" if math.isinf(value_m) else shlex.quote(format_length(value_m))
+
+
+_OPTIONS: Mapping[str, Callable[[RunFiles], Options]] = {
+    "psf": _of_psf,
+    "fabricated": _of_fabricated,
+    "tolerance": _of_tolerance,
+    "simulated": _of_simulated,
+    "explanations": _of_explanations,
+}
 
 
 def _is_there(folder: Path) -> bool:

@@ -26,16 +26,28 @@ _BANKS = (
 
 
 def banks_of(files: RunFiles) -> list[tuple[str, StoredBank]]:
-    """All PSF banks of a run, each with its name in words.
+    """All PSF banks of a run, each with its name in words, and its field where that is off the axis.
 
     Args:
         files: the run.
     """
-    return [
+    there = (
         (label, read_stored_bank(files.folder / folder / f"{name}.exr"))
         for folder, name, label in _BANKS
         if listed_bytes(files.folder / folder, f"{name}.exr") is not None
-    ]
+    )
+    return [(with_field(label, bank), bank) for label, bank in there]
+
+
+def with_field(label: str, bank: StoredBank) -> str:
+    """A name of a bank and, where that is off the axis, its field.
+
+    Args:
+        label: the name.
+        bank: the bank.
+    """
+    y, x = (f"{math.degrees(angle):.4g}°" for angle in bank.field_rad)
+    return f"{label}, field angle {y} along y, {x} along x" if any(bank.field_rad) else label
 
 
 def psf_block(banks: Sequence[tuple[str, StoredBank]]) -> PsfBlock | None:
@@ -53,6 +65,8 @@ def psf_block(banks: Sequence[tuple[str, StoredBank]]) -> PsfBlock | None:
         f"Energy per pixel of {pixel} over that of the brightest pixel at this depth and colour, in the window of "
         f"{window} pixels" + ("." if window <= _WHOLE_PX else ", averaged, or in its middle, pixel by pixel.")
     )
+    if aslant := [label for label, bank in alike if any(bank.field_rad)]:
+        note += f" Off the axis: {'; '.join(aslant)}."
     return PsfBlock("PSFs", tuple(data["banks"]), tuple(map(length, first.depths_m)), first.colours, data, note)
 
 
@@ -60,9 +74,9 @@ def compared_psfs(banks: Sequence[tuple[str, StoredBank]]) -> PsfBlock | None:
     """PSFs of several runs side by side, and those of the second less those of the first; None where none compare.
 
     Args:
-        banks: names and banks; those that differ from the first in depths, colours or pixels are left out.
+        banks: names and banks; those that differ from the first in depths, colours, pixels or field are left out.
     """
-    alike = _alike(banks) if banks else []
+    alike = [one for one in _alike(banks) if one[1].field_rad == banks[0][1].field_rad] if banks else []
     if len(alike) < 2:
         return None
     (name, first), (other_name, other) = alike[:2]
