@@ -141,7 +141,6 @@ def test_any_plate_can_be_repeated_alone(run: Path, asked: tuple[int, str, str],
         (("--budget", "rotation"), "budget: must name errors that vary in this process"),
         (("--budget", "overlay", "--yield", 90), "yield: must lie between 0 and 1"),
         (("--workers", 0), "--workers: must be at least 1"),
-        (("--draw", "normal"), "must be the key of a plate"),
         (("--draw", "normal/0", "--corners"), "--corners: must be left out with --draw"),
         (("--sobol", 8), "--sobol: must be given with --sensitivity sobol"),
         (("--yield", 0.5), "--yield: must be given with --budget"),
@@ -154,6 +153,12 @@ def test_mistakes_are_told_before_anything_is_computed(run: Path, tmp_path: Path
     assert (code, out) == (2, "")
     assert message in said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_single_plate_has_the_key_of_a_draw(run: Path):
+    code, out, said = call("tolerance", run, "--draw", "normal")
+    assert (code, out) == (2, "")
+    assert "must be the key of a plate" in said
 
 
 def test_a_process_comes_from_a_file(run: Path, tmp_path: Path):
