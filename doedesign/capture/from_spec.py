@@ -21,7 +21,7 @@ from fab.units import parse_angle, parse_length
 from sim.camera import Camera
 from sim.imaging.occlusion import Model, Outside
 from sim.metrics import mean_wavelength_m
-from sim.obstruction import OBSTRUCTIONS, ObstructionKind
+from sim.obstruction import OBSTRUCTIONS, MaskFolder, ObstructionKind
 from sim.sensor import Sensor
 
 # Luminance of linear sRGB (IEC 61966-2-1).
@@ -184,8 +184,9 @@ def _parsed(name: str, value: Any, where: str) -> Any:
 
 
 def plain_parameters(kind: Any) -> dict[str, Any]:
-    """Parameters of a kind of obstruction for JSON."""
-    return {
+    """Parameters of a kind of obstruction for JSON; of a folder of masks, what the files hold, too."""
+    contents = {"files_sha256": kind.digest()} if isinstance(kind, MaskFolder) else {}
+    return contents | {
         key: str(value) if isinstance(value, Path) else [str(v) for v in value] if key == "files" else value
         for key, value in asdict(kind).items()
         if not callable(value)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.errors import InputError
-from fab.files import explain_os_error, read_json
+from fab.files import canonical_json, explain_os_error, read_json, sha256_bytes, sha256_file
 from fab.pictures import TIFF_FILES, read_pixels
 from fab.units import UM
 from sim.imaging.scene import Obstruction
@@ -96,6 +96,11 @@ class MaskFolder(WithLimits):
             rule = f"the folder must hold a mask ({', '.join(MASK_FILES)}) that can be used"
             raise InputError(str(self.folder), rule, f"{len(found)} files, none of use", "Put masks there.")
         return good
+
+    def digest(self) -> str:
+        """SHA-256 of the pictures' names and contents, and of the files beside them that give sizes."""
+        files = [file for path in self.files for file in (path, path.with_suffix(".json")) if file.exists()]
+        return sha256_bytes(canonical_json([[file.name, sha256_file(file)] for file in files]))
 
     def _pitch_m(self, path: Path, picture: MaskPicture) -> float:
         if picture.pitch_m is not None:

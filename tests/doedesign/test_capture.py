@@ -12,6 +12,7 @@ from doedesign.capture.from_spec import (
     obstruction_from_spec,
     occlusion_from_spec,
     outside_from_kind,
+    plain_parameters,
     rgb_from_channels,
     sensor_from_spec,
 )
@@ -188,6 +189,31 @@ def test_a_folder_of_masks(tmp_path: Path):
         obstruction_from_spec(spec_of("obstruction.kind=folder"), "a.toml")
     with pytest.raises(InputError, match="an obstruction must be named"):
         obstruction_from_spec(spec_of(path=PLAIN), "a.toml")
+
+
+def test_masks_are_known_by_what_their_files_hold(tmp_path: Path):
+    from PIL import Image
+
+    def write(name: str, covered: int) -> None:
+        values = np.zeros((20, 20), np.uint8)
+        values[:covered] = 255
+        Image.fromarray(values).save(tmp_path / name)
+
+    def known() -> bytes:
+        return canonical_json(plain_parameters(MaskFolder(tmp_path, width_m=5e-3)))
+
+    write("a.png", 5)
+    write("b.png", 10)
+    first = known()
+    assert known() == first
+    write("a.png", 10)
+    write("b.png", 5)
+    exchanged = known()
+    (tmp_path / "a.json").write_text('{"width_m": 0.004}')
+    assert len({first, exchanged, known()}) == 3
+    (tmp_path / "notes.txt").write_text("not looked at")
+    (tmp_path / "a.json").unlink()
+    assert known() == exchanged
 
 
 def test_colours_of_a_picture_in_those_of_a_camera():
