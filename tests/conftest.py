@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
+import jaxtyping
 import numpy as np
 import pytest
 from jaxtyping import install_import_hook
@@ -107,6 +108,14 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
         gc.collect()
         getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)
         item.config.stash[COLLECTED] = resident_bytes()
+
+
+@pytest.fixture
+def annotations_unchecked() -> Iterator[None]:
+    """As for users, no argument is refused for its annotation: what refuses it is the code."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

@@ -143,7 +143,8 @@ def at_depth(
 
 def _parameters(kind: type[ObstructionKind], options: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Options of a spec as parameters in SI; those that begin with the name of a part of a mixed kind make that."""
-    own = [field for field in fields(cast("Any", kind)) if field.init]
+    # What makes no other kind of it, such as a function to call, is none of its parameters.
+    own = [field for field in fields(cast("Any", kind)) if field.init and field.compare]
     parts = {f.name: f.default_factory for f in own if is_dataclass(f.default_factory)}
     known = {f.name.removesuffix("_m").removesuffix("_rad"): f for f in own if f.name not in parts}
     found: dict[str, Any] = {}

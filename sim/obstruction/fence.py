@@ -84,8 +84,9 @@ class Fence(WithLimits):
 
     def __post_init__(self) -> None:
         """Check every parameter, and raise an InputError for one that cannot be meant."""
-        if not self.patterns or not set(self.patterns) <= set(get_args(Pattern)):
-            rule = f"must name patterns out of {', '.join(get_args(Pattern))}"
+        several = isinstance(self.patterns, tuple | list) and self.patterns
+        if not several or any(pattern not in get_args(Pattern) for pattern in self.patterns):
+            rule = f"must be a list of patterns out of {', '.join(get_args(Pattern))}"
             raise InputError(f"{self.name}: patterns", rule, self.patterns, "Name at least one.")
         super().__post_init__()
         if self.mesh_m[0] <= self.wire_m[1]:

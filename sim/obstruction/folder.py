@@ -24,7 +24,7 @@ from fab.pictures import TIFF_FILES, read_pixels
 from fab.units import UM
 from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb
-from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
+from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from, is_number
 from sim.obstruction.view import CameraView
 
 MASK_FILES = (".png", *TIFF_FILES)
@@ -72,9 +72,10 @@ class MaskFolder(WithLimits):
         An InputError for a parameter out of bounds, no usable picture, or one that is not usable without `on_skip`.
         """
         super().__post_init__()
-        for value in self.colour:
-            if not 0 <= value <= 1:
-                raise InputError(f"{self.name}: colour", "must lie from 0 to 1", value, "Give a number within.")
+        three = isinstance(self.colour, tuple | list) and len(self.colour) == 3
+        if not three or not all(is_number(value) and 0 <= value <= 1 for value in self.colour):
+            rule, cure = "must be three numbers from 0 to 1", "Give red, green and blue."
+            raise InputError(f"{self.name}: colour", rule, self.colour, cure)
         object.__setattr__(self, "files", tuple(self._usable()))
 
     def _usable(self) -> list[Path]:

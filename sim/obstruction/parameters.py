@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar, Protocol, runtime_checkable
+from numbers import Integral, Real
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -41,19 +42,28 @@ class WithLimits:
     """Parameters that are checked when they are given.
 
     `limits` are the smallest and largest value that can be meant, by parameter; a range lies within and runs upward.
+    A parameter is what its usual value is: a range, a whole number, or a number.
     """
 
     name: ClassVar[str]
     limits: ClassVar[Mapping[str, Range]]
 
     def __post_init__(self) -> None:
-        """Check every parameter, and raise an InputError for one that leaves its limits."""
+        """Check every parameter, and raise an InputError for one of another kind, or that leaves its limits."""
         for parameter, (low, high) in self.limits.items():
-            given, where = getattr(self, parameter), f"{self.name}: {parameter}"
-            if np.ndim(given):
-                finite = len(given) == 2 and all(math.isfinite(value) for value in given)
-                if not finite or not low <= given[0] <= given[1] <= high:
+            given, usual = getattr(self, parameter), getattr(type(self), parameter, None)
+            left_out = all(value is None for value in (given, usual))
+            whole, where = isinstance(usual, int), f"{self.name}: {parameter}"
+            if isinstance(usual, tuple):
+                two = isinstance(given, tuple | list) and len(given) == 2 and all(map(is_number, given))
+                if not two or not low <= given[0] <= given[1] <= high:
                     rule = f"must be two numbers, the smaller first, from {low:g} to {high:g}"
-                    raise InputError(where, rule, given, "Give the same number twice for a fixed value.")
-            elif given is not None and not low <= given <= high:
-                raise InputError(where, f"must lie from {low:g} to {high:g}", given, "Give a number within.")
+                    raise InputError(where, rule, repr(given), "Give the same number twice for a fixed value.")
+            elif not left_out and not (is_number(given, Integral if whole else Real) and low <= given <= high):
+                rule = f"must be a {'whole ' if whole else ''}number from {low:g} to {high:g}"
+                raise InputError(where, rule, repr(given), "Give a number within.")
+
+
+def is_number(value: Any, kind: type = Real) -> bool:
+    """Whether a value is a finite number of a kind; true and false are none."""
+    return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)

@@ -161,8 +161,19 @@ def test_options_are_physical_parameters_with_units():
         ("{clump='1 s'}", ["obstruction.options.clump", "a number with a unit"]),
         ("{clump=3}", ["obstruction.options.clump", "a number with a unit"]),
         ("{coverage=[0.5, 0.1]}", ["dirt: coverage", "the smaller first"]),
+        ("{coverage='much'}", ["dirt: coverage", "two numbers", "'much'"]),
+        ("{coverage=[0.1, 'much']}", ["dirt: coverage", "two numbers"]),
+        ("{coverage=[0.1, 0.2, 0.3]}", ["dirt: coverage", "two numbers"]),
+        ("{coverage=[[0.1, 0.2], [0.2, 0.3]]}", ["dirt: coverage", "two numbers"]),
+        ("{coverage=true}", ["dirt: coverage", "two numbers"]),
+        ("{clump='-1 mm'}", ["dirt: clump_m", "two numbers", "(-0.001, -0.001)"]),
+        ("{octaves=2.5}", ["dirt: octaves", "a whole number from 1 to 10"]),
+        ("{octaves=true}", ["dirt: octaves", "a whole number"]),
+        ("{grain=[0.1, 0.2]}", ["dirt: grain", "a number from 0 to 1"]),
+        ("{grain='coarse'}", ["dirt: grain", "a number from 0 to 1", "'coarse'"]),
     ],
 )
+@pytest.mark.usefixtures("annotations_unchecked")
 def test_options_that_make_no_sense(options: str, words: list[str]):
     with pytest.raises(InputError) as caught:
         obstruction_from_spec(spec_of(f"obstruction.options={options}"), "a.toml")
@@ -183,6 +194,9 @@ def test_a_folder_of_masks(tmp_path: Path):
     assert (made.width_m, made.depth_m) == (0.05, (0.05, 0.12))
     (tmp_path / "masks" / "bar.json").write_text('{"width_m": 0.04}')
     assert isinstance(obstruction_from_spec(spec_of(), "a.toml", str(tmp_path / "masks")), MaskFolder)
+    said = spec_of("obstruction.kind=folder", 'obstruction.options={folder="masks", on_skip="print"}')
+    with pytest.raises(InputError, match="on_skip"):  # a function of Python alone
+        obstruction_from_spec(said, str(tmp_path / "a.toml"))
     with pytest.raises(InputError, match="kind of obstruction, or a folder"):
         obstruction_from_spec(spec_of(), "a.toml", str(tmp_path / "none"))
     with pytest.raises(InputError, match="folder"):

@@ -150,6 +150,7 @@ def test_a_size_that_is_none_is_refused(tmp_path: Path, sidecar: str):
         MaskFolder(tmp_path, width_m=5e-3)
 
 
+@pytest.mark.usefixtures("annotations_unchecked")
 def test_folders_without_masks_and_wrong_parameters_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match="the folder must hold a mask"):
         MaskFolder(tmp_path)
@@ -160,6 +161,9 @@ def test_folders_without_masks_and_wrong_parameters_are_refused(tmp_path: Path):
         MaskFolder(tmp_path, width_m=-1.0)
     with pytest.raises(InputError, match="folder: colour: must"):
         MaskFolder(tmp_path, width_m=5e-3, colour=(2.0, 0.0, 0.0))
+    for colour in ((0.5,), "red", (0.1, "a", 0.2)):
+        with pytest.raises(InputError, match="colour: must be three numbers"):
+            MaskFolder(tmp_path, width_m=5e-3, colour=colour)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("seed", range(8))

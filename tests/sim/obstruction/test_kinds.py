@@ -141,6 +141,29 @@ def test_shares_end_at_one(kind: Any):
             kind(**{name: 1.01 if np.ndim(getattr(kind(), name)) == 0 else (1.01, 1.01)})
 
 
+@pytest.mark.parametrize("kind", [kind for name, kind in OBSTRUCTIONS.items() if name != "folder"])
+@pytest.mark.usefixtures("annotations_unchecked")
+def test_a_parameter_is_of_its_kind(kind: Any):
+    """A range is no number, a number is no range, and neither is text or NaN."""
+    usual = kind()
+    for name in kind.limits:
+        given = getattr(usual, name)
+        middle = float(np.mean(given))
+        wrong: list[Any] = [middle, (middle,)] if isinstance(given, tuple) else [(middle, middle)]
+        if isinstance(given, int):
+            wrong.append(given + 0.5)
+        for value in (*wrong, "1", None, True, np.nan, (np.nan, np.nan)):
+            with pytest.raises(InputError, match=f"{kind.name}: {name}: must be (two|a whole|a) number"):
+                kind(**{name: value})
+
+
+@pytest.mark.parametrize("patterns", [3, "bars", (), (["bars"],), ("chain",)])
+@pytest.mark.usefixtures("annotations_unchecked")
+def test_patterns_are_a_list_of_names(patterns: Any):
+    with pytest.raises(InputError, match="fence: patterns: must be a list of patterns"):
+        Fence(patterns=patterns)
+
+
 def test_a_fence_hangs_and_bends_by_a_tenth_of_a_metre_at_most():
     with pytest.raises(InputError, match="sag_m"):
         Fence(sag_m=(0.0, 0.11))
