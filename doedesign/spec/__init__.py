@@ -235,7 +235,7 @@ def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
         raise InputError(str(path), "the file must exist", "nothing of that name", f"Did you mean {beside}?")
     content = read_bytes(path, 1 << 24)
     try:
-        return tomllib.loads(content.decode())
+        return tomllib.loads(content.decode("utf-8-sig"))  # some editors begin a file with a mark of its encoding
     except UnicodeDecodeError as error:
         raise InputError(str(path), f"{what} must be UTF-8 text", f"a foreign byte at {error.start}", cure) from error
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits

@@ -98,15 +98,17 @@ def lines_of(response: Response, count: int) -> tuple[NDArray[np.float64], NDArr
 def read_responses(path: Path) -> list[Response]:
     """Read a response file."""
     try:
-        text = read_bytes(path, 1 << 24).decode()
+        text = read_bytes(path, 1 << 24).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(str(path), "must be a text file", f"a foreign byte at {error.start}", _CURE) from error
     kept = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    table, rows, begins = csv.reader((line for _, line in kept), strict=True), [], 0
     try:
-        cells = list(csv.reader((line for _, line in kept), strict=True))
+        for cells in table:
+            rows.append((kept[begins][0], [cell.strip() for cell in cells]))
+            begins = table.line_num  # of the next row: a cell in quotes may go on over lines
     except csv.Error as error:
         raise InputError(str(path), "must be a table with commas", f'"{error}"', _CURE) from error
-    rows = [(n, [cell.strip() for cell in row]) for (n, _), row in zip(kept, cells, strict=True)]
     if not rows:
         raise InputError(str(path), "must hold a spectral response", "no line with numbers", _CURE)
     names = None if _is_number(rows[0][1][0]) else rows.pop(0)[1]

@@ -353,6 +353,12 @@ def test_a_file_that_is_no_toml_is_refused(tmp_path: Path, content: bytes, parts
         assert part in message
 
 
+def test_a_mark_of_the_encoding_is_passed_over(tmp_path: Path):
+    path = tmp_path / "marked.toml"
+    path.write_text(AUTOMOTIVE.read_text("utf-8"), "utf-8-sig")
+    assert load_spec(path) == load_spec(AUTOMOTIVE)
+
+
 def test_truncation_anywhere_is_one_clear_message(tmp_path: Path):
     text = AUTOMOTIVE.read_bytes()
     path = tmp_path / "short.toml"

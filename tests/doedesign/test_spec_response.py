@@ -127,6 +127,8 @@ def test_lines_without_a_response_are_refused():
         ("550,-1\n560,1\n", "at least 0"),
         ("nm,red,green\n550,1\n560,1\n", "names"),
         (b"\xff\xfe550", "foreign byte"),
+        ('"wave\nlength",red\n550,1\n560,bright\n', "line 4"),
+        ('550,1\n560,"1\n', "unexpected end"),
     ],
 )
 def test_files_that_hold_no_response(tmp_path: Path, content: str | bytes, words: str):
@@ -144,6 +146,16 @@ def test_columns_without_names(tmp_path: Path):
     assert [one.name for one in responses] == ["red", "green", "blue"]
     assert responses[2].wavelengths_m == pytest.approx([500e-9, 600e-9])
     assert responses[2].values.min() == 0  # what a measurement leaves below zero
+
+
+def test_a_mark_of_the_encoding_and_names_over_two_lines(tmp_path: Path):
+    path = tmp_path / "camera.csv"
+    path.write_text('"wavelength\n(nm)",one\n500,1\n600,2\n', "utf-8-sig")
+    (response,) = read_responses(path)
+    assert response.name == "one"
+    assert list(response.values) == [1, 2]
+    path.write_text("500,1\n600,2\n", "utf-8-sig")
+    assert list(read_responses(path)[0].values) == [1, 2]
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the measured cameras are not at hand")
