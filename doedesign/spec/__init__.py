@@ -263,8 +263,11 @@ def _override(raw: dict[str, Any], text: str) -> str:
 def _put(raw: dict[str, Any], key: str, value: Any) -> None:
     *parents, last = key.split(".")
     place: Any = raw
-    for part in parents:
-        place = place.setdefault(part, {}) if isinstance(place, dict) else place[_index(place, part, key)]
+    for depth, part in enumerate(parents, 1):
+        if isinstance(place, dict):  # of a list that is not there, the first entry can be given
+            place = place.setdefault(part, [] if (depth, last) == (len(parents), "0") else {})
+        else:
+            place = place[_index(place, part, key)]
     if isinstance(place, dict):
         place[last] = value
     elif isinstance(place, list) and last == str(len(place)):

@@ -180,6 +180,10 @@ def test_an_override_of_the_entry_after_the_last_adds_one():
     assert [one.name for one in spec.objectives][3:] == ["spot_energy", "ring_to_disc"]
     assert (spec.objectives[4].weight, dict(spec.objectives[4].options)) == (0.7, {"least": 1.5})
     assert "objective[4]: must" in refusal(AUTOMOTIVE, "objective[4]=far_spot")
+    # Of a list that the spec has not, too.
+    assert not load_spec(EXAMPLES / "quick.toml").limits
+    spec = load_spec(EXAMPLES / "quick.toml", ["limit[0]={ quantity='strehl', min=0.5 }", "limit[0].min=0.6"])
+    assert [(one.quantity, one.min) for one in spec.limits] == [("strehl", 0.6)]
 
 
 @pytest.mark.parametrize(
@@ -188,6 +192,11 @@ def test_an_override_of_the_entry_after_the_last_adds_one():
         ("process.levels", 'an override must be KEY=VALUE, but got "process.levels"'),
         ("objective.5={ name='far_spot' }", "`5` must be an entry of what the spec holds there, but got a list of 4"),
         ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 4"),
+        ("focus[1].x=3", "focus.1: must be a known key of [focus], but got `1`"),
+        (
+            "areas[0].shape='disc'",
+            "overrides: areas: must be a known key of the spec, but got `areas`. Did you mean `area`?",
+        ),
         ("name.first=1", "`first` must be an entry of what the spec holds there, but got a single value"),
         ("process.levls=8", "overrides: process.levls: must be a known key of [process], but got `levls`. Did"),
         ("process.levels=8\nname='x'", "overrides: process.levels: must be a whole number"),
