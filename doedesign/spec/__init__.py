@@ -246,6 +246,11 @@ def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
 
 def _override(raw: dict[str, Any], text: str) -> str:
     """Change one value of the tables that were read; return its dotted key."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:  # bytes of the command line that are none
+        rule, cure = "an override must be UTF-8 text", "Rename the file, or type it again."
+        raise InputError("overrides", rule, f'"{text}"', cure) from error
     found = _OVERRIDE.fullmatch(text)
     if not found:
         raise InputError("overrides", "an override must be KEY=VALUE", f'"{text}"', "For example process.levels=8.")

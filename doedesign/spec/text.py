@@ -10,6 +10,7 @@ from doedesign.spec.process import ProcessSpec, SpreadSpec
 from doedesign.spec.values import UNITS, HeldAngle
 from doedesign.spec.values.table import SpecTable, toml_key
 from doedesign.spec.variation import ProcessFile, variation_file
+from fab.errors import printable
 from fab.files import canonical_json, sha256_bytes
 from fab.process import Variation
 from fab.units import parse_angle
@@ -32,7 +33,8 @@ def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
 
     Defaults are filled in, except those of optional keys, which are left out as long as they have their usual value.
     """
-    lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
+    # TOML has no control characters, not even in comments.
+    lines = [f"# {printable(line)}" for comment in comments for line in comment.splitlines()]
     in_angles = isinstance(spec, Spec) and spec.sensor.in_angles
     return "\n".join(lines + _table_lines(spec, "", in_angles)).strip() + "\n"
 

@@ -17,6 +17,7 @@ from doedesign.spec import (
     spec_digest,
     spec_from_json,
     spec_to_json,
+    spec_to_resolved_toml,
     spec_to_toml,
     spec_warnings,
 )
@@ -197,6 +198,7 @@ def test_an_override_of_the_entry_after_the_last_adds_one():
             "areas[0].shape='disc'",
             "overrides: areas: must be a known key of the spec, but got `areas`. Did you mean `area`?",
         ),
+        ("optimize.start=\udcff.exr", "overrides: an override must be UTF-8 text"),
         ("name.first=1", "`first` must be an entry of what the spec holds there, but got a single value"),
         ("process.levls=8", "overrides: process.levls: must be a known key of [process], but got `levls`. Did"),
         ("process.levels=8\nname='x'", "overrides: process.levels: must be a whole number"),
@@ -204,6 +206,17 @@ def test_an_override_of_the_entry_after_the_last_adds_one():
 )
 def test_a_wrong_override_is_named(override: str, message: str):
     assert message in refusal(AUTOMOTIVE, override)
+
+
+@pytest.mark.parametrize(
+    "start", ["\x07.exr", "a\x7f.exr", "\x00.exr", "a\n[doe]\nsamples = 2\n.exr", "a\r\x85\u2028.exr"]
+)
+def test_no_override_ends_the_remark_that_records_it(start: str, tmp_path: Path):
+    overrides = [f"optimize.start={start}"]
+    spec = load_spec(AUTOMOTIVE, overrides)
+    path = tmp_path / "spec.toml"
+    path.write_bytes(spec_to_resolved_toml(spec, overrides).encode())
+    assert load_spec(path) == spec
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
