@@ -303,12 +303,16 @@ def is_finished(folder: Path) -> bool:
 
 
 def begin_run(run: Run) -> None:
-    """Write the manifest of a claimed run that begins, its spec, and its pictures."""
-    for key, name in kept_pictures(run.spec).items():
-        if not run.path(name).is_file():
-            write_atomic(run.path(name), read_bytes(input_files(run.spec, key)[key]))
+    """Write the manifest of a claimed run that begins, its spec, and its pictures.
+
+    The manifest comes first, so that what a kill leaves is known as a run of this spec, which goes on.
+    """
+    lacking = {key: name for key, name in kept_pictures(run.spec).items() if not run.path(name).is_file()}
+    pictures = {name: read_bytes(input_files(run.spec, key)[key]) for key, name in lacking.items()}
     _write_manifest(run, "running", {})
     write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
+    for name, content in pictures.items():
+        write_atomic(run.path(name), content)
     for aside in run.folder.parent.glob(f"{glob.escape(_replaced(run.folder))}.*"):
         shutil.rmtree(aside)
 

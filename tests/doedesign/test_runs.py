@@ -23,10 +23,11 @@ from doedesign.runs.folder import (
     save_checkpoint,
     write_history,
 )
-from doedesign.spec import Spec, load_spec
+from doedesign.spec import Spec, input_files, load_spec
+from doedesign.templates import template_text
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
-from fab.files import sha256_file
+from fab.files import sha256_file, write_atomic
 
 QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
 
@@ -114,6 +115,40 @@ def test_a_run_that_got_nowhere_gives_way(run: Run):
         assert not claimed.done
         begin_run(claimed)
     assert load_spec(run.path("spec.toml")) == other
+
+
+@pytest.mark.parametrize("writes", range(4))
+def test_a_run_that_is_killed_while_it_begins_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int):
+    """Whatever number of its files it had written; and it gives way on request."""
+    for name in ("goal.png", "phase.png"):
+        (tmp_path / name).write_bytes(name.encode())
+    (tmp_path / "top_hat.toml").write_text(template_text("top_hat"), "utf-8")
+    area = ["shape='picture'", "picture='goal.png'", "phase='phase.png'", "width='500 um'"]
+    spec = load_spec(tmp_path / "top_hat.toml", [f"area={{ {', '.join(area)} }}"])
+    inputs, folder = input_digests(input_files(spec)), tmp_path / "run"
+
+    class Killed(BaseException):
+        pass
+
+    done: list[Path] = []
+
+    def until_killed(path: Path, data: bytes) -> None:
+        if len(done) == writes:
+            raise Killed
+        done.append(path)
+        write_atomic(path, data)
+
+    monkeypatch.setattr("doedesign.runs.folder.write_atomic", until_killed)
+    with pytest.raises(Killed), claim_run(folder, spec, inputs) as run:
+        begin_run(run)
+    monkeypatch.undo()
+    with claim_run(folder, spec.model_copy(update={"name": "another"}), inputs, overwrite=True) as run:
+        pass
+    with claim_run(folder, spec, inputs) as run:
+        begin_run(run)
+    kept = {"area_picture.png": b"goal.png", "area_phase.png": b"phase.png"}
+    assert {path.name for path in folder.iterdir()} == {"manifest.json", "spec.toml", *kept}
+    assert {name: run.path(name).read_bytes() for name in kept} == kept
 
 
 def test_equal_specs_are_the_same_however_written(run: Run):
