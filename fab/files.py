@@ -37,6 +37,9 @@ IF_ANY: Mapping[str, bool] = {"if_any": True}
 
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 
+# Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
+_UNFINISHED = re.compile(r"\.(?P<name>.+)\.doedesign-(file|new|old)\.[a-z0-9_]{8}", re.DOTALL)
+
 _CURES = {
     errno.EACCES: ("the place must be writable", "Choose another output folder or change its permissions."),
     errno.EPERM: ("the place must be writable", "Choose another output folder or change its permissions."),
@@ -80,7 +83,7 @@ def write_atomic(path: str | Path, data: bytes) -> None:
     path = Path(path)
     with os_errors_explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        _clear_killed(path)
+        clear_killed(path.parent, path.name.__eq__)
         temporary, handle = _locked(lambda: _made_file(path))
         try:
             with os.fdopen(handle, "wb") as stream:
@@ -130,15 +133,22 @@ def lock(handle: int) -> bool | None:
     return True
 
 
-def _clear_killed(path: Path) -> None:
-    """Remove what killed processes were writing to a path; an earlier result that one had moved aside comes back."""
-    unfinished = re.compile(rf"\.{re.escape(path.name)}\.doedesign-(file|new|old)\.[a-z0-9_]{{8}}")
-    for entry in [Path(entry) for entry in os.scandir(path.parent) if unfinished.fullmatch(entry.name)]:
+def clear_killed(folder: Path, ours: Callable[[str], object]) -> None:
+    """Remove what killed processes were writing in a folder under the names that are `ours`.
+
+    What a living process writes is locked, and stays. An earlier result that a killed one had moved aside comes back
+    where there is none.
+    """
+    for entry in [Path(entry) for entry in os.scandir(folder)]:
+        found = _UNFINISHED.fullmatch(entry.name)
+        if found is None or not ours(found["name"]):
+            continue
         with contextlib.suppress(OSError):  # another process clears it, or may not
             handle = os.open(entry, os.O_RDONLY | os.O_NOFOLLOW)
             try:
                 if not lock(handle):
                     continue
+                path = folder / found["name"]
                 if not path.exists() and (entry / path.name).exists():
                     (entry / path.name).rename(path)
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
@@ -214,7 +224,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         path = real_path(path)  # the link stays, and what it points to is replaced
     with os_errors_explained(path):
         if path.parent.is_dir():
-            _clear_killed(path)
+            clear_killed(path.parent, path.name.__eq__)
         _require_replaceable(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary, handle = _locked(lambda: _made_folder(path, "new"))

@@ -41,7 +41,16 @@ from doedesign.runtime.progress import meter
 from doedesign.spec import spec_digest, variation_to_toml
 from fab.errors import InputError
 from fab.figure import save
-from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
+from fab.files import (
+    MANIFEST_NAME,
+    atomic_folder,
+    canonical_json,
+    clear_killed,
+    read_json,
+    sha256_bytes,
+    sha256_file,
+    write_atomic,
+)
 from fab.process import Process, Variation
 from sim.imaging.occlusion import follows_light
 from sim.rigorous.edge_optic import optic_as_drawn
@@ -187,9 +196,7 @@ def _write_captures(
 
 def _require_own(folder: Path, digest: str) -> None:
     """Refuse a folder of something else, and clear away what a killed simulation was writing."""
-    for path in folder.iterdir():
-        if path.name.startswith(".") and ".doedesign-" in path.name:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    clear_killed(folder, lambda _: True)
     if not (folder / MANIFEST_NAME).is_file():
         if any(folder.iterdir()):
             rule = "a simulation needs a new or empty folder, or its own"

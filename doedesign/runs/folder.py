@@ -52,6 +52,7 @@ from fab.errors import InputError
 from fab.files import (
     MANIFEST_NAME,
     canonical_json,
+    clear_killed,
     explain_os_error,
     lock,
     read_bytes,
@@ -74,10 +75,9 @@ TRAINING_TABLES = (*CAPTURE_TABLES, "network", "train")
 # The part of the sensor that a DOE is designed for.
 _FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "defocus_m")
 
-# Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
-_UNFINISHED = re.compile(
-    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|csv|png|html)|psf|fabricated|certificate|calibration|explanations|as-built)"
-    r"\.doedesign-(file|new|old)\.[a-z0-9_]{8}"
+# What is written in the folder of a run.
+_WRITTEN = re.compile(
+    r"[\w-]+\.(json|toml|npz|exr|jsonl|csv|png|html)|psf|fabricated|certificate|calibration|explanations|as-built"
 )
 
 
@@ -169,9 +169,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         if lock(handle) is False:
             rule = "only one process may work in a run folder"
             raise InputError(str(folder), rule, "a second one", "Wait for the first.")
-        for path in folder.iterdir():
-            if _UNFINISHED.fullmatch(path.name):
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        clear_killed(folder, _WRITTEN.fullmatch)
         yield
     finally:
         os.close(handle)

@@ -27,7 +27,7 @@ from doedesign.spec import Spec, input_files, load_spec
 from doedesign.templates import template_text
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
-from fab.files import sha256_file, write_atomic
+from fab.files import atomic_folder, sha256_file, write_atomic
 
 QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
 
@@ -219,6 +219,20 @@ def test_only_temporary_files_are_cleared_away(run: Run):
     run.path(".psf.doedesign-new.abcdefgh").mkdir()
     with alone_in(run.folder):
         assert {path.name for path in run.folder.iterdir()} == {*kept, "manifest.json", "spec.toml"}
+
+
+def test_what_a_living_process_writes_in_a_run_is_left_alone(run: Run):
+    """Such as a picture or PSFs by a command that needs no claim; a result that a killed one moved aside comes back."""
+    aside = run.path(".certificate.doedesign-old.abcd_123")
+    (aside / "certificate").mkdir(parents=True)
+    (aside / "certificate" / "manifest.json").write_text("{}")
+    with atomic_folder(run.path("psf")) as fresh:
+        (fresh / "x").write_text("1")
+        with alone_in(run.folder):
+            pass
+        assert (fresh / "x").exists()
+    assert {path.name for path in run.folder.iterdir()} == {"manifest.json", "spec.toml", "psf", "certificate"}
+    assert [path.name for path in run.path("certificate").iterdir()] == ["manifest.json"]
 
 
 def test_nothing_stays_open(run: Run, spec: Spec):
