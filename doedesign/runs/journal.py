@@ -31,7 +31,7 @@ def study_folder(folder: Path, study: Mapping[str, Any]) -> Iterator[None]:
         study: all that the results depend on, for JSON; kept in the folder.
 
     Raises:
-        InputError: the folder holds another study or something else, or another process works in it.
+        InputError: the folder holds results of another study or something else, or another process works in it.
     """
     with alone_in(folder):
         _claim(folder, study)
@@ -51,7 +51,11 @@ def _claim(folder: Path, asked: Mapping[str, Any]) -> None:
         return
     found = read_json(path)
     different = [key for key in sorted(found.keys() | study.keys()) if found.get(key) != study.get(key)]
-    if different:
+    held = [p for p in folder.iterdir() if p.name != STUDY_NAME and not (p.is_file() and p.stat().st_size == 0)]
+    if different and not held:
+        # It was refused before its first result: there is nothing to lose, whatever it was.
+        write_atomic(path, canonical_json(study))
+    elif different:
         rule, cure = "the folder must belong to this study", "Choose another folder, or remove that study."
         raise InputError(str(folder), rule, f"one with another {', '.join(different)}", cure)
 

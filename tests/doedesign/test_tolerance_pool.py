@@ -190,6 +190,22 @@ def test_a_folder_keeps_one_study(ask: Callable[..., Study], fakes: ModuleType, 
         ask(out=out).monte_carlo(2)
 
 
+def test_a_study_that_was_refused_before_its_first_draw_gives_way(ask: Callable[..., Study], tmp_path: Path):
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="limit on on_target"):
+        ask(out=out, limits=["on_target >= 0.5"]).monte_carlo(1)
+    assert lines(out / "draws.jsonl") == []
+    ask(out=out, seed=1).monte_carlo(1)
+    assert json.loads((out / "study.json").read_text())["seed"] == 1
+    with pytest.raises(InputError, match="one with another seed"):
+        ask(out=out).monte_carlo(1)
+    # Nor does anything else that lies there.
+    (tmp_path / "b" / "external").mkdir(parents=True)
+    (tmp_path / "b" / "study.json").write_text("{}")
+    with pytest.raises(InputError, match="belong to this study"):
+        ask(out=tmp_path / "b").monte_carlo(1)
+
+
 DAMAGED = [
     b"[1]",
     b"[" * 100_000,
