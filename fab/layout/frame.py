@@ -40,6 +40,8 @@ _CORNERS = 180
 _BAR_M, _BAR_LONG_M, _BAR_GAP_M = 20 * UM, 200 * UM, 10 * UM
 # Marks at the flat: two bars of this length and width, and between them the gap in which the edge of the wafer lies.
 _EDGE_LONG_M, _EDGE_WIDE_M, _EDGE_GAP_M = 3 * MM, 0.4 * MM, 0.1 * MM
+# Bars at a notch are at least so long, where the blank leaves less room than their usual length; its rim holds nothing.
+_SHORTEST_BAR_M, _BLANK_RIM_M = 0.5 * MM, 1 * MM
 
 
 class Frame(NamedTuple):
@@ -198,6 +200,9 @@ def _edge_marks(photomask: Photomask, wafer: Wafer, dbu_m: float) -> Part:
 
     The edge of the wafer lies in the gap between the two bars of each mark; the middle of a notch between two upright
     bars below the wafer.
+
+    Raises:
+        InputError: a blank without room for the bars at the notch.
     """
     flat_m, unit = wafer.usual_flat_m, _InUnits(dbu_m)
     long, wide, gap = unit(_EDGE_LONG_M), unit(_EDGE_WIDE_M), unit(_EDGE_GAP_M / 2)
@@ -211,6 +216,11 @@ def _edge_marks(photomask: Photomask, wafer: Wafer, dbu_m: float) -> Part:
             places[f"flat {name}, {photomask.name}"] = (x * dbu_m, y * dbu_m)
     elif wafer.notch_m:
         y = -unit(wafer.diameter_m / 2) - gap
+        long = min(long, unit(wafer.blank_m / 2 - _BLANK_RIM_M) + y)
+        if long < unit(_SHORTEST_BAR_M):
+            room = format_length(_BLANK_RIM_M + _SHORTEST_BAR_M + _EDGE_GAP_M / 2)
+            rule = f"must leave {room} below the notch for marks"
+            raise InputError("wafer: blank_m", rule, format_length(wafer.blank_m), "Choose a larger mask blank.")
         boxes = [(-gap - wide, y - long, -gap, y), (gap, y - long, gap + wide, y)]
         places[f"notch, {photomask.name}"] = (0.0, -wafer.diameter_m / 2)
     else:
@@ -262,7 +272,7 @@ def _labels(photomasks: Sequence[Photomask], wafer: Wafer, job: Job, dbu_m: floa
 
     Where the blank has no room beside the wafer, they are smaller, on the rim that is excluded.
     """
-    radius, most = wafer.diameter_m / 2, wafer.blank_m / 2 - 1 * MM
+    radius, most = wafer.diameter_m / 2, wafer.blank_m / 2 - _BLANK_RIM_M
     for letters_m, low in ((_LETTERS_M, radius + GAP_M), (_LETTERS_M / 2, radius - wafer.edge_exclusion_m)):
         blocks = [label_block([(p, mask_label(job, p, wafer.reading))], letters_m, dbu_m) for p in photomasks]
         labels = centred(row(blocks, 4 * letters_m))

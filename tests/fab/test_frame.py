@@ -224,6 +224,21 @@ def test_the_first_photomask_shows_where_the_flat_or_the_notch_belongs(diameter_
         assert gaps == [y - 50_000] * 2 + [y + 50_000] * 2
 
 
+def test_marks_at_the_notch_are_as_long_as_the_blank_has_room():
+    def lengths(blank_m):
+        wafer = Wafer(diameter_m=0.2, blank_m=blank_m)
+        shapes = framed(wafer, chrome_m=4e-3).cells[-1].shapes
+        drawn = next(drawn.rectangles for layer, drawn in shapes.items() if layer.datatype == 1)
+        assert (drawn[:, 1] >= -round((blank_m / 2 - 1e-3) * 1e9)).all()
+        return (drawn[:, 3] - drawn[:, 1]).tolist()
+
+    assert lengths(0.2286) == [3_000_000] * 2
+    # Of 8 inches: 1.6 mm below the wafer, less half the gap and the rim of 1 mm that holds nothing.
+    assert lengths(0.2032) == [550_000] * 2
+    with pytest.raises(InputError, match="below the notch for marks, but got 203 mm"):
+        lengths(0.203)
+
+
 def test_splits_are_repeated_all_over_the_wafer():
     frame = framed(Wafer(line_splits_m=(1e-7, -1e-7), order_control=True))
     for number in (1, 2, 3):
