@@ -25,7 +25,7 @@ from fab.solids.columns import Columns, reduced_cells, whole, window_cells
 from fab.solids.mesh import closed_volume_m3, relief_mesh
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
 from fab.solids.step import step_bodies
-from fab.solids.substrate import ChromeRing, Rings, Substrate, substrate_bodies, substrate_step
+from fab.solids.substrate import ChromeFilm, Rings, Substrate, substrate_bodies, substrate_step
 from fab.units import MM, NM, UM
 
 BASE = 5 * UM
@@ -49,7 +49,7 @@ def bench_step(quick: bool, folder: Path) -> None:
     """Print the STEP file of a radial design with a step at every ring."""
     count = 2000 if quick else 8000
     rings = Rings(np.arange(1, count + 1) * 2.2 * MM / count, np.arange(count) % 16 * 75 * NM, 1125 * NM)
-    die, chrome = Substrate("die", 10 * MM, 0.5 * MM), ChromeRing(RoundAperture(4.39 * MM), 3.7 * MM)
+    die, chrome = Substrate("die", 10 * MM, 0.5 * MM), ChromeFilm(RoundAperture(4.39 * MM), 3.7 * MM)
     path = folder / "r.step"
     # The kernel takes its time to load, and every process does that once.
     substrate_step(folder / "first.step", die, RoundAperture(4.4 * MM), chrome)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.layout.floorplan import GAP_M, Floorplan, floorplan, middle_of
-from fab.layout.geometry import Cell, Layer, Reference, Shapes, chrome_layer, outline_shapes
+from fab.layout.geometry import Box, Cell, Layer, Reference, Shapes, chrome_layer, outline_shapes
 from fab.layout.lettering import Job, label_block, mask_label, written
 from fab.layout.marks import alignment_site, die_marks
 from fab.layout.part import Part, Photomask, centred, joined, moved, prefixed, row, without
@@ -53,6 +53,7 @@ class Frame(NamedTuple):
         plan: where dies, sites and monitors lie.
         pitch_m: distance of the dies, metres.
         die_m: edge of a die without the saw lanes, metres.
+        bare_m: boxes x0, y0, x1, y1 that chrome to the edges of a die as ordered leaves around marks, metres.
     """
 
     cells: tuple[Cell, ...]
@@ -60,6 +61,7 @@ class Frame(NamedTuple):
     plan: Floorplan
     pitch_m: float
     die_m: float
+    bare_m: tuple[tuple[float, float, float, float], ...]
 
     @property
     def dies(self) -> tuple[tuple[float, float], ...]:
@@ -136,8 +138,10 @@ def draw_frame(
     beside = prefixed(moved(marks, *plan.dies[middle_of(plan.dies)]), "middle die: ")
     monitors = [prefixed(moved(monitor, *at), f"{name}: ") for name, at in plan.monitors.items()]
     places = joined([*sites, beside, *monitors, labels]).places
+    x0, y0, x1, y1 = (edge * dbu_m for edge in _bare(marks))
+    bare_m = ((x0, y0, x1, y1),) if wafer.chrome_to_edge else ()
     small = (Cell(names["SITE"], site.shapes), Cell(names["TEST"], monitor.shapes))
-    return Frame((*die_cells, *small, wafer_cell, top), places, plan, pitch, die_m)
+    return Frame((*die_cells, *small, wafer_cell, top), places, plan, pitch, die_m, bare_m)
 
 
 def _title(marks: Part, split: DieSplit, photomask: Photomask) -> Part:
@@ -168,15 +172,22 @@ def _chrome_to_edge(chrome: Shapes, layer: Layer, die_m: float, bare: Sequence[P
     """Draw chrome from that around the aperture to the edges of the die, with room around marks and words."""
     dbu_m = bare[0].dbu_m
     unit = _InUnits(dbu_m)
-    edge, margin = unit(die_m / 2), unit(_BAR_M)
+    edge = unit(die_m / 2)
     square = max(map(abs, chrome.box or (0,))) + unit(GAP_M / 2)
-    holes = [(x0 - margin, y0 - margin, x1 + margin, y1 + margin) for x0, y0, x1, y1 in (part.box for part in bare)]
-    rest = without([(-edge, -edge, edge, edge)], [(-square, -square, square, square), *holes])
+    holes = [(-square, -square, square, square), *map(_bare, bare)]
+    rest = without([(-edge, -edge, edge, edge)], holes)
     # Sectors reach the outer circle; the frame around a rectangular opening lies within them.
     reaches = [np.hypot(*polygon.T.astype(np.float64)).max() for polygon in chrome.polygons]
     sectors = (p for p, reach in zip(chrome.polygons, reaches, strict=True) if reach > max(reaches) - 2)
     polygons = tuple(_to_square(sector, square) for sector in sectors)
     return Part(dbu_m, {layer: Shapes(rest.astype(np.int32), polygons)}, {})
+
+
+def _bare(part: Part) -> Box:
+    """Return the box that chrome leaves around marks or words."""
+    margin = _InUnits(part.dbu_m)(_BAR_M)
+    x0, y0, x1, y1 = part.box
+    return x0 - margin, y0 - margin, x1 + margin, y1 + margin
 
 
 def _to_square(sector: NDArray[np.int32], square: int) -> NDArray[np.int32]:

@@ -56,7 +56,7 @@ class DrawnOrder:
     def model(self) -> DoeModel:
         """The DOE as solids and height maps show it."""
         order, frame = self.order, self.frame
-        at, cells = (frame.die_m, frame.dies), order.formats.mesh_cells
+        at, cells = (frame.die_m, frame.dies, frame.bare_m), order.formats.mesh_cells
         return DoeModel(order.level_map, order.chrome, order.wafer, *at, order.patch, order.direct_write, cells)
 
     def kept(self, what: str, make: Callable[[], T]) -> T:

@@ -37,7 +37,8 @@ class MeshedRelief:
 class DoeModel:
     """A DOE on its glass, as all models show it: chrome, edge of its die and middles of the dies on the wafer, metres.
 
-    A `patch` is the window that is wanted at full resolution, if any; `direct_write` whether files for direct-write and
+    Where the chrome reaches to the edge of a die, `bare_m` are the boxes x0, y0, x1, y1 that it leaves around marks. A
+    `patch` is the window that is wanted at full resolution, if any; `direct_write` whether files for direct-write and
     greyscale exposure are wanted; the mesh of the whole relief has at most `mesh_cells` columns either way.
     """
 
@@ -46,6 +47,7 @@ class DoeModel:
     wafer: Wafer
     die_m: float
     dies: Sequence[tuple[float, float]]
+    bare_m: Sequence[tuple[float, float, float, float]] = ()
     patch: Patch | None = None
     direct_write: bool = False
     mesh_cells: int = 200

@@ -12,7 +12,6 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import reduce
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,10 +105,12 @@ def filled(corners_m: Sequence[tuple[float, float]]) -> Any:
     return occ.BRepBuilderAPI_MakeFace(_polygon([_point(x, y, 0) for x, y in corners_m], closed=True)).Face()
 
 
-def _holed(surface: Any, hole: Any) -> Any:
-    """Return a plane face less another inside it."""
-    wire = occ.TopoDS.Wire_s(next(_inside(hole, occ.TopAbs_WIRE)).Reversed())
-    return occ.BRepBuilderAPI_MakeFace(surface, wire).Face()
+def holed(surface: Any, holes: Iterable[Any]) -> Any:
+    """Return a plane face less others inside it."""
+    for hole in holes:
+        wire = occ.TopoDS.Wire_s(next(_inside(hole, occ.TopAbs_WIRE)).Reversed())
+        surface = occ.BRepBuilderAPI_MakeFace(surface, wire).Face()
+    return surface
 
 
 def _parted(division: Division, surface: Any) -> tuple[list[Any], list[Any]]:
@@ -118,17 +119,20 @@ def _parted(division: Division, surface: Any) -> tuple[list[Any], list[Any]]:
 
     def faces(parts: list[tuple[int | None, list[int]]]) -> list[Any]:
         grounds = [surface if outer is None else loops[outer] for outer, _ in parts]
-        return [
-            reduce(_holed, (loops[n] for n in inner), face) for face, (_, inner) in zip(grounds, parts, strict=True)
-        ]
+        return [holed(face, (loops[n] for n in inner)) for face, (_, inner) in zip(grounds, parts, strict=True)]
 
     return faces(division.open), faces(division.closed)
 
 
-def framed(radius_m: float, division: Division, thickness_m: float) -> Any:
-    """Return a disc of some thickness (metres) on z = 0 without the open parts of a division, metres."""
-    _, closed = _parted(division, outline(2 * radius_m, 0.0))
-    solids = [occ.BRepPrimAPI_MakePrism(part, occ.gp_Vec(0, 0, thickness_m / MM)).Shape() for part in closed]
+def raised(surface: Any, thickness_m: float) -> Any:
+    """Return the solid of some thickness (metres) above a face at z = 0."""
+    return slab(surface, -thickness_m)
+
+
+def framed(surface: Any, division: Division, thickness_m: float) -> Any:
+    """Return a film of some thickness (metres) on a face at z = 0, without the open parts of a division, metres."""
+    _, closed = _parted(division, surface)
+    solids = [raised(part, thickness_m) for part in closed]
     return solids[0] if len(solids) == 1 else _compound(solids)
 
 

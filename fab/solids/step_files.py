@@ -19,7 +19,7 @@ from fab.solids.patch import patch_body, patch_step
 from fab.solids.rings import pixel_share, ring_levels, rings_from_levels
 from fab.solids.step import step_bodies, step_differences
 from fab.solids.substrate import (
-    ChromeRing,
+    ChromeFilm,
     Rings,
     Substrate,
     division_of,
@@ -37,13 +37,23 @@ _MOST_CORNERS = 1500
 _RELATIVE_ERROR = 1e-11
 
 
-def _die(model: DoeModel) -> tuple[Substrate, ChromeRing]:
+def _die(model: DoeModel) -> tuple[Substrate, ChromeFilm]:
     glass = Substrate("die", model.die_m, model.wafer.thickness_m)
     return glass, _chrome(model)
 
 
-def _chrome(model: DoeModel) -> ChromeRing:
-    return ChromeRing(model.chrome.opening(model.level_map.relief), model.chrome.rim_m(model.level_map))
+def _chrome(model: DoeModel) -> ChromeFilm:
+    drawn = model.chrome.opening(model.level_map.relief), model.chrome.rim_m(model.level_map)
+    if not model.wafer.chrome_to_edge:
+        return ChromeFilm(*drawn)
+    return ChromeFilm(*drawn, edge_m=model.die_m, bare_m=tuple(model.bare_m))
+
+
+def _reach(model: DoeModel) -> str:
+    """Return in words how far the chrome goes, and what of it is left out."""
+    if not model.wafer.chrome_to_edge:
+        return "chrome as a ring"
+    return "chrome to the edges of a die but for the window of its marks"
 
 
 def _drawable(model: DoeModel) -> bool:
@@ -69,11 +79,11 @@ def _rings(model: DoeModel) -> tuple[Rings | None, str]:
     level_map = model.level_map
     levels_of_rings = ring_levels(level_map)
     if levels_of_rings is None:
-        return None, "millimetres; one die, relief plane at z = 0, where the relief is drawn flat"
+        return None, f"millimetres; one die, relief plane at z = 0, where the relief is drawn flat; {_reach(model)}"
     share = 100 * pixel_share(level_map, levels_of_rings)
     return rings_from_levels(levels_of_rings, level_map), (
         f"millimetres; one die, blank surface at z = 0, relief of {len(levels_of_rings)} rings as exact circles; "
-        f"the masks draw them in pixels, with another height on {share:.2g} % of the relief"
+        f"the masks draw them in pixels, with another height on {share:.2g} % of the relief; {_reach(model)}"
     )
 
 
@@ -90,12 +100,12 @@ def _write_die(path: Path, model: DoeModel) -> None:
     substrate_step(path, glass, model.level_map.relief, chrome, _rings(model)[0])
 
 
-def _wafer(model: DoeModel) -> tuple[Substrate, ChromeRing]:
+def _wafer(model: DoeModel) -> tuple[Substrate, ChromeFilm]:
     """Return the wafer, with a flat unless the dies need its place, and the chrome of a die."""
     wafer = model.wafer
     chrome = _chrome(model)
     glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m, wafer.usual_flat_m)
-    if glass.flat_m and not all(glass.holds(x, y, chrome.outer_m) for x, y in model.dies):
+    if glass.flat_m and not all(glass.holds(x, y, chrome) for x, y in model.dies):
         glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m)
     return glass, chrome
 
@@ -107,7 +117,7 @@ def _wafer_entry(path: Path, model: DoeModel) -> ModelEntry | None:
     flat = f"primary flat of {format_length(glass.flat_m)} at -y, as usual for this diameter (SEMI M1)"
     about = (
         f"millimetres; the wafer before it is diced, {flat if glass.flat_m else 'no flat'}; chrome of "
-        f"{len(model.dies)} dies, no relief"
+        f"{len(model.dies)} dies, no relief; {_reach(model)}"
     )
     return model_entry(path, about, wafer_bodies(glass, chrome, model.dies), _RELATIVE_ERROR)
 

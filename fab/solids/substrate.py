@@ -25,11 +25,14 @@ from fab.solids.step import (
     Body,
     Copies,
     disc,
+    filled,
     framed,
+    holed,
     marked_plate,
     opened,
     outline,
     plate,
+    raised,
     revolved,
     slab,
     write_step,
@@ -70,9 +73,12 @@ class Substrate:
         """Radius of the largest centred circle on the surface, metres."""
         return math.sqrt((self.width_m / 2) ** 2 - (self.flat_m / 2) ** 2)
 
-    def holds(self, x_m: float, y_m: float, radius_m: float) -> bool:
-        """Whether a circle about x, y lies on the surface of a wafer."""
-        return math.hypot(x_m, y_m) + radius_m <= self.width_m / 2 and radius_m - y_m <= self.inside_m
+    def holds(self, x_m: float, y_m: float, chrome: "ChromeFilm") -> bool:
+        """Whether the chrome of a die about x, y lies on the surface of a wafer."""
+        half = chrome.half_m
+        corner, side = math.hypot(abs(x_m) + half, abs(y_m) + half), math.hypot(x_m, y_m) + half
+        farthest = corner if chrome.edge_m else side
+        return farthest <= self.width_m / 2 * (1 + 1e-12) and half - y_m <= self.inside_m * (1 + 1e-12)
 
     @property
     def area_m2(self) -> float:
@@ -91,8 +97,15 @@ class Substrate:
 
 
 @dataclass(frozen=True)
-class ChromeRing:
-    """Chrome around the clear aperture: the opening, outer radius and thickness of the film, metres.
+class ChromeFilm:
+    """Chrome around the clear aperture, metres: a ring, or all of a square die.
+
+    Attributes:
+        opening: its opening.
+        outer_m: radius that it reaches to, also where a square goes on from there.
+        thickness_m: thickness of the film.
+        edge_m: edge of the square that it fills; 0 for a ring.
+        bare_m: boxes x0, y0, x1, y1 of the square, beyond the radius, that have no chrome.
 
     Raises:
         InputError: the opening does not lie inside, or a length is not positive.
@@ -101,6 +114,8 @@ class ChromeRing:
     opening: Aperture
     outer_m: float
     thickness_m: float = 100 * NM
+    edge_m: float = 0.0
+    bare_m: tuple[tuple[float, float, float, float], ...] = ()
 
     def __post_init__(self) -> None:
         inside = self.opening.narrowest_m > 0 and self.opening.reach_m < self.outer_m < math.inf
@@ -110,21 +125,35 @@ class ChromeRing:
             raise InputError("chrome", rule, got, "Check the lengths.")
 
     @property
+    def half_m(self) -> float:
+        """Half the width of the film."""
+        return self.edge_m / 2 or self.outer_m
+
+    @property
     def body(self) -> Body:
         """The film around the opening, on z = 0."""
-        area = math.pi * self.outer_m**2 - self.opening.area_m2
-        if isinstance(self.opening, RoundAperture):
-            area = math.pi * (self.outer_m + self.opening.reach_m) * (self.outer_m - self.opening.reach_m)
         y_m, x_m = self.opening.centroid_m
-        # What the opening takes from the disc moves its centre away.
-        x, y = (-at * self.opening.area_m2 / area for at in (x_m, y_m))
+        gone = [(self.opening.area_m2, x_m, y_m)]
+        gone += [((x1 - x0) * (y1 - y0), (x0 + x1) / 2, (y0 + y1) / 2) for x0, y0, x1, y1 in self.bare_m]
+        area = self.edge_m**2 or math.pi * self.outer_m**2
+        area -= math.fsum(part for part, _, _ in gone)
+        if isinstance(self.opening, RoundAperture) and not self.edge_m:
+            area = math.pi * (self.outer_m + self.opening.reach_m) * (self.outer_m - self.opening.reach_m)
+        # What is taken from the film moves its centre away.
+        x, y = (-math.fsum(part[0] * part[axis] for part in gone) / area for axis in (1, 2))
         return Body(area * self.thickness_m, (x, y, self.thickness_m / 2))
 
     def solid(self) -> Any:
         """The same as a shape of the kernel."""
         low, high = 0.0, self.thickness_m
+        if self.edge_m:
+            windows = [filled([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) for x0, y0, x1, y1 in self.bare_m]
+            surface = holed(outline(self.edge_m, None), windows)
+            if isinstance(self.opening, RoundAperture):
+                return raised(holed(surface, [outline(2 * self.opening.reach_m, 0.0)]), high)
+            return framed(surface, division_of(self.opening), high)
         if not isinstance(self.opening, RoundAperture):
-            return framed(self.outer_m, division_of(self.opening), high)
+            return framed(outline(2 * self.outer_m, 0.0), division_of(self.opening), high)
         inner_m = self.opening.reach_m
         corners = [(inner_m, low), (self.outer_m, low), (self.outer_m, high), (inner_m, high)]
         return revolved(corners, closed=True)
@@ -183,11 +212,11 @@ class Rings:
         return corners if corners[-1][0] == rim else [*corners, (rim, 0.0)]
 
 
-def _require_fit(substrate: Substrate, relief: Aperture, chrome: ChromeRing | None, rings: Rings | None) -> None:
+def _require_fit(substrate: Substrate, relief: Aperture, chrome: ChromeFilm | None, rings: Rings | None) -> None:
     # Chrome may reach the edge of the glass; the rim of the relief must leave some surface around it.
     most = {"relief": (relief.reach_m, 1 - 1e-6)}
     if chrome is not None:
-        most["chrome"] = (chrome.outer_m, 1 + 1e-12)
+        most["chrome"] = (chrome.half_m, 1 + 1e-12)
     for name, (radius, share) in most.items():
         if not 0 < radius <= share * substrate.inside_m:
             got = f"a diameter of {format_length(2 * radius)}"
@@ -202,7 +231,7 @@ def _require_fit(substrate: Substrate, relief: Aperture, chrome: ChromeRing | No
 
 
 def substrate_bodies(
-    substrate: Substrate, chrome: ChromeRing | None = None, rings: Rings | None = None
+    substrate: Substrate, chrome: ChromeFilm | None = None, rings: Rings | None = None
 ) -> dict[str, Body]:
     """Return volume and centre of every solid that `substrate_step` writes, by closed form and name."""
     glass = substrate.body
@@ -221,7 +250,7 @@ def substrate_step(
     path: str | Path,
     substrate: Substrate,
     relief: Aperture,
-    chrome: ChromeRing | None = None,
+    chrome: ChromeFilm | None = None,
     rings: Rings | None = None,
 ) -> None:
     """Write the plate as STEP: glass, chrome and the place of the relief in the datum plane.
@@ -255,7 +284,7 @@ def division_of(aperture: Aperture) -> Division:
     return Division(aperture.outlines_m(0), [(0, [])], [(None, [0])])
 
 
-def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]) -> dict[str, Body]:
+def wafer_bodies(wafer: Substrate, chrome: ChromeFilm, places_m: Sequence[tuple[float, float]]) -> dict[str, Body]:
     """Return volume and centre of every solid that `wafer_step` writes, by closed form and name."""
     x, y = (math.fsum(axis) / len(places_m) for axis in zip(*places_m, strict=True))
     one = chrome.body
@@ -264,12 +293,12 @@ def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[
 
 
 def wafer_step(
-    path: str | Path, wafer: Substrate, relief: Aperture, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]
+    path: str | Path, wafer: Substrate, relief: Aperture, chrome: ChromeFilm, places_m: Sequence[tuple[float, float]]
 ) -> None:
     """Write a wafer as STEP: flat glass; chrome and place of the relief of every die about its middle x, y, metres."""
     for x, y in places_m:
-        if not wafer.holds(x, y, chrome.outer_m):
-            got = f"a chrome of {format_length(2 * chrome.outer_m)} at {format_length(x)}, {format_length(y)}"
+        if not wafer.holds(x, y, chrome):
+            got = f"a chrome of {format_length(2 * chrome.half_m)} at {format_length(x)}, {format_length(y)}"
             raise InputError("wafer", "the dies must lie on it", got, "Take fewer dies, or a larger wafer.")
     parts = {
         "SUBSTRATE": slab(outline(wafer.width_m, wafer.flat_m), wafer.thickness_m),

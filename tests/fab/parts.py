@@ -23,6 +23,27 @@ def chrome_of_dies(order: Path) -> Iterator[list[Any]]:
         yield [polygon for polygon in die.get_polygons() if polygon.layer == chrome.layer]
 
 
+def die_chrome(order: Path) -> Any:
+    """Chrome of a die of an order without its marks, all that its cell places included, merged by KLayout."""
+    from klayout import db
+
+    manifest, layout = read_manifest(order), db.Layout()
+    layout.read(str(order / manifest.combined_oasis))
+    die = next(cell for cell in layout.each_cell() if cell.name.endswith("_DIE"))
+    return db.Region(die.begin_shapes_rec(layout.layer(manifest.chrome.layer, 0))).merged()
+
+
+def marks_window_um(order: Path) -> tuple[float, float, float, float]:
+    """The box x0, y0, x1, y1 around the marks of a die of an order in which it has no chrome, micrometres."""
+    from klayout import db
+
+    chrome = die_chrome(order)
+    (window,) = (
+        hole.bbox() for hole in (db.Region(chrome.bbox()) - chrome).each() if hole.bbox().right > 0 > hole.bbox().top
+    )
+    return window.left * 1e-3, window.bottom * 1e-3, window.right * 1e-3, window.top * 1e-3
+
+
 def region(part: Part | Cell, *layers: Layer):
     """What KLayout makes of some layers of a part or a cell, not merged."""
     from klayout import db

@@ -26,7 +26,7 @@ from fab.order.write import write_planned
 from fab.solids.step import step_bodies
 from tests.fab.maps import FEW, PLAIN
 from tests.fab.mended import mend, restate, told
-from tests.fab.parts import chrome_of_dies
+from tests.fab.parts import chrome_of_dies, marks_window_um
 
 UM = 1e-6
 GRID = Grid((30, 40), 2 * UM)
@@ -130,17 +130,19 @@ def test_the_order_is_proved_from_its_files_and_its_request(written):
 def test_solids_have_the_volumes_and_the_centres_of_the_mask(written):
     manifest = read_manifest(written)
     plate, wafer = (step_bodies(next(written.glob(f"*_{name}.step"))) for name in ("PLATE", "WAFER"))
-    whole = math.pi * (manifest.chrome.outer_diameter_mm / 2 * 1e3) ** 2
-    wanted = (whole - AREA_UM2) * 0.1 * UM**3
-    assert plate["CHROME"].volume_m3 == pytest.approx(wanted, rel=1e-9)
-    assert wafer["CHROME"].volume_m3 == pytest.approx(9 * wanted, rel=1e-9)
+    window = marks_window_um(written)
+    bare = (window[2] - window[0]) * (window[3] - window[1])
+    area = (manifest.wafer.die_mm * 1e3) ** 2 - AREA_UM2 - bare
+    wanted = area * 0.1 * 1e-9  # mm3
+    assert plate["CHROME"].volume_m3 * 1e9 == pytest.approx(wanted, rel=1e-9)
+    assert wafer["CHROME"].volume_m3 * 1e9 == pytest.approx(9 * wanted, rel=1e-9)
     # Sums of x and y over the open area, box by box; the chrome's centre lies on the other side.
-    boxes = [(*LEFT_OPEN[0], 1), (*LEFT_OPEN[1], 1), (*LEFT_ISLAND, -1)]
+    boxes = [(*LEFT_OPEN[0], 1), (*LEFT_OPEN[1], 1), (*LEFT_ISLAND, -1), (*window, 1)]
     sums = [
         sum(sign * (x1 - x0) * (y1 - y0) * at for x0, y0, x1, y1, sign in boxes for at in [middle(x0, y0, x1, y1)])
         for middle in (lambda x0, y0, x1, y1: (x0 + x1) / 2, lambda x0, y0, x1, y1: (y0 + y1) / 2)
     ]
-    centre = [-one / (whole - AREA_UM2) * UM for one in sums]
+    centre = [-one / area * UM for one in sums]
     assert plate["CHROME"].centre_m[:2] == pytest.approx(centre, abs=1e-12)
 
 

@@ -9,7 +9,7 @@ import tifffile
 from fab.aperture import RoundAperture
 from fab.manifest.records import read_manifest
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
-from fab.solids.substrate import ChromeRing, Substrate, substrate_step
+from fab.solids.substrate import ChromeFilm, Substrate, substrate_step
 from fab.units import MM
 from tests.fab.maps import SMALL
 from tests.fab.mended import mend, restate, told
@@ -37,8 +37,9 @@ def test_a_mesh_of_something_else_is_named(order_folder, end, what):
 
 def test_a_solid_of_something_else_is_named(order_folder):
     pitch = read_manifest(order_folder).wafer.die_pitch_mm * MM
-    glass, ring = Substrate("die", pitch, 0.5 * MM), ChromeRing(RoundAperture(19.6e-6), 0.6 * MM, 200e-9)
-    substrate_step(order_folder / f"{SMALL}_PLATE.step", glass, RoundAperture(29.6e-6), ring)
+    glass, window = Substrate("die", pitch, 0.5 * MM), (-0.8 * MM, -1.5 * MM, 0.8 * MM, -1.2 * MM)
+    film = ChromeFilm(RoundAperture(19.6e-6), 0.6 * MM, 200e-9, pitch, (window,))
+    substrate_step(order_folder / f"{SMALL}_PLATE.step", glass, RoundAperture(29.6e-6), film)
     mend(order_folder, f"{SMALL}_PLATE.step")
     assert "CARTESIAN_POINT" in told(order_folder, f"{SMALL}_PLATE.step")
     path = order_folder / f"{SMALL}_WAFER.step"

@@ -24,6 +24,7 @@ from fab.solids.step import step_bodies
 from fab.solids.write import model_problems, write_models
 from fab.units import MM, NM, UM
 from tests.fab.maps import FEW, level_map_from
+from tests.fab.parts import die_chrome
 from tests.orders import named
 
 LEVELS, GRID = Levels(16, 75 * NM), Grid((30, 30), 2 * UM)
@@ -73,10 +74,20 @@ def test_the_wafer_of_an_order(written_order):
     half = np.arcsin(0.325)
     area = 2500 * (np.pi - half + np.sin(half) * np.cos(half))
     assert body["SUBSTRATE"].volume_m3 / MM**3 == pytest.approx(area * 0.5, rel=1e-12)
-    assert isinstance(manifest.chrome.opening_diameter_mm, float)
-    inner, outer = manifest.chrome.opening_diameter_mm / 2, manifest.chrome.outer_diameter_mm / 2
-    # The STEP has the radii as asked for, the masks on whole nanometres.
-    assert body["CHROME"].volume_m3 / MM**3 == pytest.approx(dies * 1e-4 * np.pi * (outer**2 - inner**2), rel=1e-5)
+    assert "chrome to the edges of a die" in entry.content
+    drawn_mm2 = die_chrome(written_order).area() * 1e-12  # on whole nanometres
+    # As the masks draw it; they have chords of 10 nm at most for the arcs of the opening, and whole nanometres.
+    assert body["CHROME"].volume_m3 / MM**3 == pytest.approx(dies * 1e-4 * drawn_mm2, rel=1e-6)
+
+
+def test_chrome_is_a_ring_in_step_where_it_does_not_reach_the_edge(tmp_path):
+    level_map = level_map_from(np.zeros((8, 8)), LEVELS, UM, 8 * UM)
+    shown = DoeModel(level_map, Chrome(UM), Wafer(chrome_to_edge=False), 5 * MM, ((0.0, 0.0),))
+    found = {entry.file: entry for entry in write_models(tmp_path, "A", shown)}
+    ring_mm2 = np.pi * (shown.chrome.rim_m(level_map) ** 2 - (3 * UM) ** 2) / MM**2
+    for name in ("A_PLATE.step", "A_WAFER.step"):
+        assert "chrome as a ring" in found[name].content
+        assert found[name].volumes_mm3["CHROME"] == pytest.approx(ring_mm2 * 1e-4, rel=1e-12)
 
 
 @pytest.mark.parametrize(

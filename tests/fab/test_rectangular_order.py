@@ -28,7 +28,7 @@ from fab.runsheet.as_built import read_as_built
 from fab.solids.step import step_bodies
 from tests.fab.maps import FEW, PLAIN
 from tests.fab.mended import mend, restate, told
-from tests.fab.parts import chrome_of_dies
+from tests.fab.parts import chrome_of_dies, marks_window_um
 
 UM, MM = 1e-6, 1e-3
 LEVELS = Levels(4, 0.3e-6)
@@ -117,15 +117,15 @@ def test_solids_have_the_volumes_of_the_rectangle(written):
     manifest = read_manifest(written)
     plate = next(written.glob("*_PLATE.step"))
     bodies = step_bodies(plate)
-    outer = manifest.chrome.outer_diameter_mm / 2
-    wanted = (math.pi * outer**2 - 0.07 * 0.05) * 1e-4
+    x0, y0, x1, y1 = marks_window_um(written)
+    wanted = (manifest.wafer.die_mm**2 - 0.07 * 0.05 - (x1 - x0) * (y1 - y0) * 1e-6) * 1e-4
     assert bodies["CHROME"].volume_m3 / MM**3 == pytest.approx(wanted, rel=1e-9)
     wafer = step_bodies(next(written.glob("*_WAFER.step")))
     assert wafer["CHROME"].volume_m3 / MM**3 == pytest.approx(9 * wanted, rel=1e-9)
     text = plate.read_text()
     # The outline of the relief, a face of its own on the surface.
     assert text.count("'DATUM_RELIEF'") > 0
-    assert "CYLINDRICAL_SURFACE" in text  # of the chrome's rim
+    assert "CYLINDRICAL_SURFACE" not in text  # of a ring
 
 
 def test_the_run_sheet_asks_for_width_and_height(written, tmp_path):

@@ -8,7 +8,7 @@ from fab.aperture import RectangularAperture, RoundAperture
 from fab.errors import InputError
 from fab.solids.step import step_bodies
 from fab.solids.substrate import (
-    ChromeRing,
+    ChromeFilm,
     Rings,
     Substrate,
     substrate_bodies,
@@ -21,7 +21,7 @@ from fab.units import MM, NM, UM
 DIE = Substrate("die", 10 * MM, 0.5 * MM)
 WAFER = Substrate("wafer", 100 * MM, 0.5 * MM)
 FLAT = Substrate("wafer", 100 * MM, 0.5 * MM, 32.5 * MM)
-CHROME = ChromeRing(RoundAperture(2 * 2.195 * MM), 3.7 * MM)
+CHROME = ChromeFilm(RoundAperture(2 * 2.195 * MM), 3.7 * MM)
 APERTURE = RoundAperture(4.4 * MM)
 # The kernel integrates planes and cylinders in closed form; what is left is float64 of millimetres in text.
 CLOSE = 1e-12
@@ -55,6 +55,22 @@ def test_a_plate_reads_back_with_the_volumes_of_closed_form(tmp_path, substrate,
     want = volumes(substrate_bodies(substrate, CHROME, rings))
     assert volumes(step_bodies(tmp_path / "p.step")) == pytest.approx(want, rel=CLOSE)
     assert want["CHROME"] == pytest.approx(math.pi * (3.7**2 - 2.195**2) * 1e-4 * 1e-9, rel=1e-14)
+
+
+@pytest.mark.parametrize("opening", [RoundAperture(4 * MM), RectangularAperture((3 * MM, 2 * MM))])
+def test_chrome_fills_a_square_but_for_its_opening_and_what_is_left_bare(tmp_path, opening):
+    window = (-2 * MM, -4.9 * MM, 3 * MM, -4.5 * MM)
+    film = ChromeFilm(opening, 3.7 * MM, edge_m=10 * MM, bare_m=(window,))
+    substrate_step(tmp_path / "p.step", DIE, opening, film)
+    body = substrate_bodies(DIE, film)["CHROME"]
+    area = 100 - opening.area_m2 / MM**2 - 2.0
+    assert body.volume_m3 == pytest.approx(area * 1e-4 * MM**3, rel=1e-14)
+    # The window of 2 mm2 lies about 0.5, -4.7.
+    assert body.centre_m == pytest.approx((-2 * 0.5 / area * MM, 2 * 4.7 / area * MM, 50 * NM), rel=1e-14)
+    found = step_bodies(tmp_path / "p.step")["CHROME"]
+    assert found.volume_m3 == pytest.approx(body.volume_m3, rel=CLOSE)
+    assert found.centre_m == pytest.approx(body.centre_m, abs=1e-15)
+    assert sizes(shapes_of(tmp_path / "p.step")["CHROME"]) == pytest.approx([-5, 5, -5, 5, 0, 1e-4], abs=1e-9)
 
 
 def test_volumes_of_closed_form_by_hand():
@@ -207,8 +223,8 @@ def test_writing_prints_nothing(tmp_path, capfd):
         (lambda: Substrate("die", MM, math.nan), "substrate thickness"),
         (lambda: Substrate("die", 10 * MM, MM, MM), "a die has none"),
         (lambda: Substrate("wafer", 10 * MM, MM, 10 * MM), "shorter than the diameter"),
-        (lambda: ChromeRing(RoundAperture(2 * 2 * MM), 2 * MM), "make a ring"),
-        (lambda: ChromeRing(RoundAperture(2 * 1 * MM), 2 * MM, 0.0), "make a ring"),
+        (lambda: ChromeFilm(RoundAperture(2 * 2 * MM), 2 * MM), "make a ring"),
+        (lambda: ChromeFilm(RoundAperture(2 * 1 * MM), 2 * MM, 0.0), "make a ring"),
         (lambda: Rings(np.array([2.0, 1.0]) * MM, np.zeros(2), UM), "at least 0.3 nm wide"),
         (lambda: Rings(np.array([MM]), np.zeros(2), UM), "one length"),
         (lambda: Rings(np.array([MM]), np.array([2 * UM]), UM), "heights must lie"),
@@ -225,7 +241,7 @@ def test_impossible_parts_are_refused(make, words):
     [
         (DIE, RoundAperture(10 * MM), None, None, "relief"),
         (DIE, RoundAperture(-MM), None, None, "relief"),
-        (DIE, APERTURE, ChromeRing(RoundAperture(2 * 2 * MM), 5.1 * MM), None, "chrome"),
+        (DIE, APERTURE, ChromeFilm(RoundAperture(2 * 2 * MM), 5.1 * MM), None, "chrome"),
         (Substrate("wafer", 10 * MM, MM, 8 * MM), APERTURE, CHROME, None, "circle of 6 mm"),
         (DIE, RoundAperture(4.3 * MM), None, some_rings(), "inside the relief"),
         (Substrate("die", 10 * MM, UM), APERTURE, None, some_rings(), "less deep"),
