@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 
 MANIFEST_NAME = "manifest.json"
-# A field with this mark is left out of records where it is empty, so that records without it stay what they are.
+# A field with this mark is left out of records where it is its default, so that records without it stay what they are.
 IF_ANY: Mapping[str, bool] = {"if_any": True}
 
 _NO_TEXT = re.compile("[\ud800-\udfff]")

@@ -28,6 +28,7 @@ class Material:
     """A transparent material at room temperature."""
 
     name: str
+    title: str  # as people write it
     range_m: tuple[float, float]  # shortest and longest vacuum wavelength the formula was fitted for, metres
     # Index as a function of the wavelength in micrometres and `terms`
     formula: Callable[[float, tuple[tuple[float, float], ...]], float]
@@ -49,6 +50,7 @@ MATERIALS: dict[str, Material] = {
     for m in (
         Material(
             "fused_silica",
+            "fused silica",
             (0.21e-6, 6.7e-6),
             _sellmeier,
             ((0.6961663, 0.0684043**2), (0.4079426, 0.1162414**2), (0.8974794, 9.896161**2)),
@@ -56,6 +58,7 @@ MATERIALS: dict[str, Material] = {
         ),
         Material(
             "n_bk7",
+            "N-BK7",
             (0.3e-6, 2.5e-6),
             _sellmeier,
             ((1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)),
@@ -63,6 +66,7 @@ MATERIALS: dict[str, Material] = {
         ),
         Material(
             "p_bk7",
+            "P-BK7",
             (0.31e-6, 2.5e-6),
             _sellmeier,
             ((1.18318503, 0.00722141956), (0.0871756426, 0.0268216805), (1.03133701, 101.702362)),
@@ -70,6 +74,7 @@ MATERIALS: dict[str, Material] = {
         ),
         Material(
             "pmma",
+            "PMMA",
             (0.4368e-6, 1.052e-6),
             _sellmeier,
             ((1.1819, 0.011313),),
@@ -77,6 +82,7 @@ MATERIALS: dict[str, Material] = {
         ),
         Material(
             "pmma_resist",
+            "PMMA resist",
             (0.2e-6, 1.1e-6),
             _cauchy,
             ((1.488, 0), (0.002898, -2), (0.0001579, -4)),
@@ -84,6 +90,7 @@ MATERIALS: dict[str, Material] = {
         ),
         Material(
             "su8",
+            "SU-8",
             (0.32e-6, 0.80e-6),
             _cauchy,
             ((1.566, 0), (0.00796, -2), (0.00014, -4)),

@@ -31,13 +31,12 @@ from fab.order.order import Order, plan_order
 from fab.order.terms import OrderTerms
 from fab.order.write import WrittenOrder, write_planned
 from fab.process import Process, Variation
-from fab.runsheet.tables import SheetPrediction
+from fab.runsheet.tables import SILICA, SheetPrediction
 from fab.solids.patch import Patch
 from fab.units import metres
+from sim.material import material
 
 log = logging.getLogger("doedesign")
-
-_RECIPE = "fused_silica"  # the material of the run sheet's wafer and etches
 
 
 def write_masks(
@@ -95,11 +94,9 @@ def write_masks(
     if not isinstance(terms, OrderTerms):
         asked = spec.order if spec else OrderSpec()
         terms = terms_from_spec(asked if terms is None else load_order(terms))
-    if spec is not None and spec.doe.material != _RECIPE:
-        said = (
-            "the run sheet's wafer and etches are those of fused silica, but the design is for %s: correct them there"
-        )
-        log.warning(said, spec.doe.material)
+    made_of = SILICA if spec is None else material(spec.doe.material).title
+    if made_of != SILICA:
+        log.warning("the run sheet leaves cleaning, plasma and rates to the lab: its recipe is not for %s", made_of)
     order = plan_order(
         level_map,
         process=made_by,
@@ -113,6 +110,7 @@ def write_masks(
         waves_per_metre=spec and camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m),
         papers=True,
         formats=formats,
+        material=made_of,
     )
     if order.repair is not None and design is not None:
         repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map)}

@@ -187,6 +187,7 @@ def predict_sheet(
             Grating(error, *grating_orders(depths * (1 + error), material, probe_m)) for error in _DEPTH_ERRORS
         ),
         ranking=ranking,
+        index=refractive_index(material, design_m),
     )
 
     def picture() -> bytes:

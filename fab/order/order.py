@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_bytes
+from fab.files import IF_ANY, canonical_json, sha256_bytes
 from fab.layout.compensation import edge_moves
 from fab.layout.geometry import Chrome, pixel_edges
 from fab.layout.lettering import Job
@@ -23,7 +23,7 @@ from fab.order.terms import OrderTerms
 from fab.process import Process
 from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair import Repair, repaired
-from fab.runsheet.tables import Predictions
+from fab.runsheet.tables import SILICA, Predictions
 from fab.solids.patch import Patch
 from fab.stock import STOCK, process_from
 from fab.units import NM, UM, format_length
@@ -69,6 +69,7 @@ class Order:
         papers: whether a run sheet and pictures of the wafer, its marks and broken rules come with the masks.
         light: what the run sheet says of the light, if anything.
         formats: in which formats it is written.
+        material: what the wafer is made of, in words, for the run sheet.
 
     Raises:
         InputError: floors as deep as the wafer is thick.
@@ -86,6 +87,7 @@ class Order:
     papers: bool = False
     light: Light | None = None
     formats: Formats = field(default_factory=Formats)
+    material: str = field(default=SILICA, metadata=IF_ANY)
 
     def __post_init__(self) -> None:
         """Raise an InputError for floors that leave no glass below them."""
@@ -236,6 +238,7 @@ def plan_order(
     waves_per_metre: float | None = None,
     papers: bool = False,
     formats: Formats | None = None,
+    material: str = SILICA,
 ) -> Order:
     """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`.
 
@@ -255,7 +258,7 @@ def plan_order(
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
     asked: dict[str, Any] = {"patch": patch, "terms": terms, "papers": papers, "direct_write": direct_write}
-    asked["formats"] = formats or Formats()
+    asked |= {"formats": formats or Formats(), "material": material}
     order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
     if made_by.name in STOCK and (said := STOCK[made_by.name].not_drawn):
         log.warning("process %s: %s", made_by.name, said)

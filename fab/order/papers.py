@@ -104,6 +104,7 @@ def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str], made_by: Mapping[s
             Die(f"die {number}", x, y, order.splits[split].words)
             for number, ((x, y), split) in enumerate(zip(frame.dies, frame.splits, strict=True), 1)
         ),
+        material=order.material,
         predictions=None if order.light is None else order.light.predictions,
         request_sha256=request_digest(request_of(order), made_by),
     )

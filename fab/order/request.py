@@ -22,15 +22,14 @@ from fab.rules.check import Rules, check
 
 # The rules are those of the process, and a repaired level map needs no second repair.
 _ASKED = tuple(field.name for field in fields(Order) if field.name not in ("rules", "repair"))
+_IF_ANY = {field.name for field in fields(Order) if "if_any" in field.metadata}
 _CURE = "Fetch the manifest again, or write the order again."
 
 
 def _plain(value: Any) -> Any:
-    """Turn a value into JSON values, fields by name; without fields that are there `IF_ANY`, and are empty."""
+    """Turn a value into JSON values, fields by name; without fields that are there `IF_ANY`, and are default."""
     if is_dataclass(value):
-        parts = {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-        left_out = [field.name for field in fields(value) if "if_any" in field.metadata and not parts[field.name]]
-        return {name: part for name, part in parts.items() if name not in left_out}
+        return _without_defaults(value, {field.name: _plain(getattr(value, field.name)) for field in fields(value)})
     if hasattr(value, "_asdict"):
         return _plain(value._asdict())
     if isinstance(value, Mapping):
@@ -38,11 +37,16 @@ def _plain(value: Any) -> Any:
     return [_plain(part) for part in value] if isinstance(value, tuple | list) else value
 
 
+def _without_defaults(value: Any, parts: Mapping[str, Any]) -> dict[str, Any]:
+    usual = {field.name: _plain(field.default) for field in fields(value) if "if_any" in field.metadata}
+    return {name: part for name, part in parts.items() if not (name in usual and part == usual[name])}
+
+
 def request_of(order: Order) -> dict[str, Any]:
     """Return the request of an order as JSON values."""
     level_map = order.level_map
     drawn = {"name": level_map.name, "shape": list(level_map.shape), "pitch_m": level_map.grid.pitch_m}
-    asked = {name: _plain(getattr(order, name)) for name in _ASKED}
+    asked = _without_defaults(order, {name: _plain(getattr(order, name)) for name in _ASKED})
     return {"level_map": {**drawn, "aperture_m": level_map.relief.record()}, **asked}
 
 
@@ -54,7 +58,8 @@ def order_from(request: Mapping[str, Any], level: NDArray[np.uint8], where: str)
     """
     hints = get_type_hints(Order)
     try:
-        asked = {name: TypeAdapter(hints[name]).validate_python(request[name]) for name in _ASKED}
+        given = [name for name in _ASKED if name in request or name not in _IF_ANY]
+        asked = {name: TypeAdapter(hints[name]).validate_python(request[name]) for name in given}
         drawn = request["level_map"]
         grid = Grid(level.shape, float(drawn["pitch_m"]))
         relief = aperture_from(drawn["aperture_m"])

@@ -1,7 +1,8 @@
 """Recipe for each photomask, step by step, and the arithmetic of a run sheet.
 
 The recipes are ordinary ones for fused silica: resist, reactive ions through it, chrome by lift-off or wet etch. Doses,
-bakes and times belong to the lab and are left blank; what follows from the order is filled in.
+bakes and times belong to the lab and are left blank; what follows from the order is filled in. For another material the
+words on cleaning, plasma, rates and resist, which hold for silica alone, are left out, and the lab's own are asked for.
 
 Depth first: every etch has its own target, whatever another one did. If a design uses all sets of masks equally, the
 light that goes where it should is a product with one factor per mask, cos^2(phi / 2) for a phase error phi of its
@@ -17,7 +18,7 @@ from fab.layout.marks import alignment_notes
 from fab.layout.part import Photomask
 from fab.levels import Levels
 from fab.process import Normal, Process
-from fab.runsheet.tables import RunSheet
+from fab.runsheet.tables import SILICA, RunSheet
 from fab.units import NM, UM, format_length
 
 Deposition = Literal["evaporated", "sputtered"]
@@ -135,12 +136,15 @@ def _printing(
     )
 
 
-def _etch_actions(photomask: Photomask, process: Process) -> tuple[Action, ...]:
+def _etch_actions(photomask: Photomask, process: Process, material: str) -> tuple[Action, ...]:
     depth_m, bit = photomask.depth_m, photomask.bit or 0
     sigma = spread_of(process, bit, "common_depth_scale", "depth_scale").sigma
     usual = "" if not sigma else f" (usual for this process: within {_TWO_SIGMA * sigma * depth_m / NM:.3g} nm)"
     aim_m = expected_m(photomask, process)
     known = f" This process is known to etch {aim_m / NM:.6g} nm where it is told that." if aim_m != depth_m else ""
+    ions = "Reactive ions (CHF3 or alike) into the glass"
+    if material != SILICA:
+        ions = f"Into the {material}, by the lab's recipe for it"
     return (
         Action("Descum", "Oxygen plasma, short, so that no film of resist is left in the openings.", ("time (s)",)),
         Action(
@@ -150,7 +154,7 @@ def _etch_actions(photomask: Photomask, process: Process) -> tuple[Action, ...]:
         ),
         Action(
             "Etch",
-            f"Reactive ions (CHF3 or alike) into the glass, TARGET {photomask.depth}{usual}.{known} "
+            f"{ions}, TARGET {photomask.depth}{usual}.{known} "
             "Find the rate on a test piece of the same glass, the same chamber and the same day. Time = target / rate.",
             ("rate (nm/min)", "time (min:s)", "recipe"),
         ),
@@ -181,12 +185,20 @@ def _chrome_actions(photomask: Photomask, chrome_m: float, deposition: Depositio
     )
 
 
-def least_resist(photomask: Photomask, chrome_m: float, deposition: Deposition) -> tuple[float, str]:
+def least_resist(
+    photomask: Photomask, chrome_m: float, deposition: Deposition, material: str = SILICA
+) -> tuple[float, str]:
     """Return the least thickness of the resist, metres, and why.
 
     For lift-off it is five times the metal if that is evaporated and ten times if it is sputtered, because sputtered
-    metal also covers the walls; for an etch twice what it uses up at a selectivity of 3, and at least 1 um.
+    metal also covers the walls; for an etch of fused silica twice what it uses up at a selectivity of 3, and at least 1
+    um. What an etch of another material uses up is not known here.
     """
+    if photomask.makes == "etch" and material != SILICA:
+        return (
+            _THINNEST_M,
+            f"Find out what an etch of {photomask.depth} into the {material} uses up, and take twice that.",
+        )
     if photomask.makes == "etch":
         used = format_length(float(f"{photomask.depth_m / _SELECTIVITY:.3g}"))
         why = f"At a selectivity of {_SELECTIVITY:g} the etch uses up {used} of it; thicker resist prints coarser."
@@ -221,8 +233,10 @@ def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
     for number, (photomask, note) in enumerate(zip(sheet.photomasks, alignment_notes(sheet.photomasks), strict=True)):
         etched |= {photomask.bit: expected_m(photomask, process)} if photomask.bit is not None else {}
         align = note if number else f"{_by_the_edge(sheet)} {note}"
-        thickness_m, why = least_resist(photomask, chrome_m, deposition)
+        thickness_m, why = least_resist(photomask, chrome_m, deposition, sheet.material)
         how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."
+        if sheet.material != SILICA:
+            how = f"By the lab's recipe for {sheet.material}. Dry."
         if number == 0:
             how = f"Check thickness, flat and both polished faces, and mark the side to be etched. {how}"
         before = [Action("Clean", how, ("wafer number",) if number == 0 else ())]
@@ -233,7 +247,7 @@ def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
             photomask, sheet.files[photomask.name].file, align, thickness_m, why, sheet.wafer.edge_exclusion_m
         )
         after = (
-            _etch_actions(photomask, process)
+            _etch_actions(photomask, process, sheet.material)
             if photomask.makes == "etch"
             else _chrome_actions(photomask, chrome_m, deposition)
         )

@@ -16,6 +16,9 @@ from fab.level_map import LevelMap
 from fab.process import Process
 from fab.units import NM
 
+# What the recipes of the run sheet, and the stock processes, are for.
+SILICA = "fused silica"
+
 
 class PhotomaskFile(NamedTuple):
     """The file of one photomask: its name, digest and top cell.
@@ -101,6 +104,7 @@ class Predictions:
         probe_waves: the full height in waves at the probe.
         gratings: what the test gratings show at the probe, against an empty window; a depth error of 0 among them.
         ranking: measured numbers, the most important first; empty if the process has no errors.
+        index: refractive index of the material at the design wavelength; 0 if it is not stated.
         certified: 0th orders that a certificate of this DOE names; empty if it has none.
     """
 
@@ -112,6 +116,7 @@ class Predictions:
     probe_waves: float
     gratings: tuple[Grating, ...]
     ranking: tuple[Importance, ...] = ()
+    index: float = field(default=0.0, metadata=IF_ANY)
     certified: tuple[CertifiedOrder, ...] = field(default=(), metadata=IF_ANY)
 
 
@@ -161,7 +166,7 @@ class RunSheet:
     wafer: Wafer
     places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     dies: tuple[Die, ...] = ()
-    material: str = "fused silica"
+    material: str = SILICA
     chrome_m: float = 100 * NM
     deposition: Literal["evaporated", "sputtered"] = "evaporated"
     predictions: Predictions | None = None

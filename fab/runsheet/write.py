@@ -26,7 +26,7 @@ from fab.runsheet.recipe import (
     steps_of,
     tone_words,
 )
-from fab.runsheet.tables import OPENING_KEYS, Predictions, RunSheet
+from fab.runsheet.tables import OPENING_KEYS, SILICA, Predictions, RunSheet
 from fab.units import MM, NM, UM
 
 FORMAT = "doedesign run sheet 1"
@@ -158,6 +158,7 @@ def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> d
         "times": [
             {"rate_nm_per_min": round(rate * 60 / NM, 6), "time_s": round(photomask.depth_m / rate)}
             for rate in RATES_M_PER_S
+            if sheet.material == SILICA
         ],
         "pads": _depth_rows(sheet, photomask),
         "over_the_wafer": _uniformity_rows(sheet, photomask),
@@ -220,11 +221,13 @@ def _row(values: NamedTuple) -> dict[str, Any]:
 
 
 def _predicted_record(predictions: Predictions) -> dict[str, Any]:
-    full = predictions.full_wave_m
+    full, index = predictions.full_wave_m, predictions.index
+    wave_m = predictions.design_m / (index - 1) if index else 0.0
     return {
         "as_drawn": [_row(seen) for seen in predictions.drawn],
         "expected": [_row(seen) for seen in predictions.expected],
         "design_wavelength_nm": _nm(predictions.design_m),
+        **({"index": round(index, 5), "wave_height_nm": round(wave_m / NM, 2)} if index else {}),
         "full_wave_wavelength_nm": None if full is None else round(full / NM, 1),
         "probe_wavelength_nm": _nm(predictions.probe_m),
         "waves_at_probe": round(predictions.probe_waves, 5),
@@ -275,6 +278,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "order": _order_record(sheet),
         "wafer": {
             "material": sheet.material,
+            "recipe_for": SILICA,
             "diameter_mm": round(wafer.diameter_m / MM, 6),
             "thickness_mm": round(wafer.thickness_m / MM, 6),
             "finish": "both faces polished",

@@ -1,5 +1,6 @@
 """Whose mask order a folder holds: nothing of another design is replaced, and every command finds a run's own."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -16,8 +17,10 @@ from doedesign.runs import fabricated
 from doedesign.runs.level_maps import open_design
 from doedesign.runs.orders import is_order_of, order_of_run, own_level_map, require_replaceable
 from fab.errors import InputError
+from fab.files import canonical_json
 from fab.level_map import LevelMap
 from fab.levels import Levels
+from fab.order.request import order_from, request_of
 from fab.order.write import write_order
 from fab.process import Process
 from tests.doedesign.small_runs import SPEC, call, finished_run
@@ -126,6 +129,22 @@ def test_the_order_of_a_height_map_may_be_drawn_again_and_is_told_by_its_file(pl
     code, _, said = call("masks", "map.npy", *bare)
     assert (code, len(places)) == (2, 2)
     assert 'the order of the height map "map.npy"' in said
+
+
+@pytest.mark.usefixtures("work")
+def test_an_order_is_made_of_the_material_of_its_design(tmp_path, monkeypatch):
+    planned = []
+    monkeypatch.setattr(lab, "write_planned", lambda folder, order, predict: planned.append(order))
+    (tmp_path / "made").mkdir()
+    finished_run(tmp_path / "made", SPEC.replace('"fused_silica"', '"n_bk7"')).rename(Path("runs") / "bk7")
+    lab.write_masks(Path("runs") / "bk7", Path("masks") / "bk7")
+    lab.write_masks(Path("runs") / "coarse", Path("masks") / "coarse")
+    assert [order.material for order in planned] == ["N-BK7", "fused silica"]
+    # The manifest tells it where it is not the usual one, so that earlier manifests are read as before.
+    for order, told in zip(planned, (True, False), strict=True):
+        request = json.loads(canonical_json(request_of(order)))
+        assert ("material" in request) == told
+        assert order_from(request, order.level_map.level, "manifest").material == order.material
 
 
 @pytest.mark.usefixtures("work")

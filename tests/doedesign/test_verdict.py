@@ -91,6 +91,7 @@ def test_sheets_speak_of_the_map_that_was_certified(run: Path, levels: int | Non
     seen = asked["predict"](asked["order"]).predictions
     wanted = certified_orders(run, digest_of(run)) if levels is None else ()
     assert seen == replace(predictions(), certified=wanted)
+    assert asked["order"].material == "fused silica"
     # A manifest records it, and what it recorded before there were certificates can still be read.
     order = replace(asked["order"], light=Light(seen, "0" * 64))
     request = json.loads(canonical_json(request_of(order)))

@@ -160,6 +160,33 @@ def test_times_are_depth_over_rate():
     assert "30:00 min" in page_of(record(sheet())).text
 
 
+def test_what_holds_for_silica_alone_is_left_out_for_another_material():
+    silica, other = record(sheet()), record(sheet(material="N-BK7"))
+    assert "CHF3" in page_of(silica).text
+    assert "has to be the lab's own recipe" not in page_of(silica).text
+    page = page_of(other).text
+    for words in ("16 levels in N-BK7", "This wafer is not fused silica", "Into the N-BK7, by the lab's recipe for it"):
+        assert words in page
+    for words in ("CHF3", "Acetone", "selectivity of 3", "nm/min it is"):
+        assert words not in page, words
+        assert words in page_of(silica).text, words
+    # Depths are the design's, whatever they are etched into.
+    for one, same in zip(silica["steps"], other["steps"], strict=True):
+        if one["etch"]:
+            assert {**one["etch"], "times": []} == same["etch"]
+
+
+def test_the_index_stands_beside_the_material():
+    known = replace(predictions(), index=1.4599)
+    content = record(sheet(predictions=known))
+    assert content["predicted"]["index"] == 1.4599
+    assert content["predicted"]["wave_height_nm"] == round(550 / 0.4599, 2)
+    assert (
+        "n = 1.4599 at the design wavelength of 550 nm: one wave is 1195.9 nm of fused silica" in page_of(content).text
+    )
+    assert "index" not in record(sheet(predictions=predictions()))["predicted"]
+
+
 def test_the_correction_keeps_the_sum_of_all_etches():
     next_m = next_target_m(75 * NM, 80 * NM, 150 * NM)
     assert next_m == pytest.approx(145 * NM)
