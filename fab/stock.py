@@ -45,7 +45,8 @@ class Number(NamedTuple):
 class Stock:
     """The usual numbers of one kind of process, errors by their name in `DEVIATIONS` (zero where missing).
 
-    `not_drawn` says what it takes in place of the plates of an order, which print a whole wafer by contact.
+    `not_drawn` says what it takes in place of the plates of an order, which print a whole wafer by contact; `reduction`
+    how many times as large as on the wafer its reticles are.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Stock:
     defects: Mapping[str, Figure]
     tone: Literal["clear", "dark"] = "clear"
     not_drawn: str = ""
+    reduction: int = 1
 
     def numbers(self) -> Iterator[Number]:
         """Yield every number with its source, errors first, in the order of `DEVIATIONS`."""
@@ -99,6 +101,11 @@ def process_from(given: Process | str | None, levels: Levels) -> Process:
     if given not in known:
         raise InputError("process", "must be a process or the name of one", repr(given), f"Name {' or '.join(known)}.")
     return known[given].process(levels)
+
+
+def reduction_of(process: Process) -> int:
+    """How many times as large as on the wafer the reticles of a process are, by its name; 1 for plates at contact."""
+    return STOCK[process.name].reduction if process.name in STOCK else 1
 
 
 # --- rare events ------------------------------------------------------------------------------------------------------
@@ -173,8 +180,7 @@ _STEPPER_OVERLAY = estimate(
 _STEPPER = Stock(
     name="stepper",
     title="i-line wafer stepper, numerical aperture 0.5, reticles five times as large",
-    not_drawn="a stepper takes reticles with the DOE of one die, five times as large; these masks are plates for "
-    "contact printing, a whole wafer at 1:1: let the mask shop enlarge the cell of a die",
+    reduction=5,
     errors=_errors(
         Typical(0.0, 50e-9, _STEPPER_OVERLAY),
         rotation_rad=Typical(0.0, 1e-6, estimate("the overlay at marks 70 mm apart: 50 nm * sqrt(2) / 70 mm")),

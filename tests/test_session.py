@@ -78,7 +78,7 @@ def test_rules_orders_and_their_proof(design: dd.Design, tmp_path: Path):
     rules = fab.check(design.level_map, "contact_aligner")
     assert not rules.clean
     shown(rules)
-    order = fab.write_order(tmp_path / "quick", design.level_map, process="stepper")
+    order = fab.write_order(tmp_path / "quick", design.level_map, process="contact_aligner")
     report = fab.verify(order)
     assert report.passed
     assert "<table" in report._repr_html_()

@@ -177,6 +177,7 @@ def masks(
     plates: Literal["gds.gz", "gds"] = "gds.gz",
     combined_gds: Flag = False,
     mesh_cells: int = 200,
+    one_to_one: Flag = False,
     overwrite: Flag = False,
     json_: AsJson = False,
 ) -> None:
@@ -208,6 +209,7 @@ def masks(
         plates: Files of the photomasks: GDSII packed by gzip, or plain.
         combined_gds: Write the layout of all layers as GDSII, too, and not only as OASIS.
         mesh_cells: Most columns of the mesh of the whole relief along x and y, up to 1000.
+        one_to_one: Take plates at 1:1 for a stepper, too, from which the mask shop makes its reticles.
         overwrite: Where the folder has the order of another design, replace that order.
     """
     if as_built is not None:
@@ -217,7 +219,7 @@ def masks(
         refuse_options(masks, fixed, rule, "Leave it out: the order has its own.")
         drawn: dict[str, object] = {"out": out, "patch": patch, "mesh_patch": mesh_patch, "on_violation": on_violation}
         drawn |= {"plates": plates, "mesh_cells": mesh_cells, "direct_write": direct_write}
-        drawn |= {"combined_gds": combined_gds, "overwrite": overwrite}
+        drawn |= {"combined_gds": combined_gds, "one_to_one": one_to_one, "overwrite": overwrite}
         refuse_options(masks, drawn, rule, "Leave it out: nothing is drawn.")
         _predict_as_built(source, as_built, order, process, json_)
         return
@@ -240,6 +242,7 @@ def masks(
             patch=_patch(patch, mesh_patch),
             formats=Formats(plates, combined_gds, mesh_cells),
             overwrite=overwrite,
+            one_to_one=one_to_one,
             process=process,
             wafer=wafer,
             terms=terms,

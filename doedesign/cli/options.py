@@ -95,6 +95,7 @@ _OPTIONS = {
     "Give `occlusion`:": "Add occlusion to [scene], or give --occlusion:",
     "Give the function by `objectives`, if you trust it.": "Add --allow-code, if you trust the spec.",
     "give `overwrite`": "give --overwrite",
+    "take plates at 1:1 by `one_to_one`": "take plates at 1:1 by --one-to-one",
     "leave `images` out": "leave --images out",
     "Choose another folder": "Choose another --out",
     "take fewer workers.": "take fewer workers (--workers).",

@@ -93,6 +93,7 @@ _OF_GROUP = (
             "kind",
             "mesh_cells",
             "mesh_patch",
+            "one_to_one",
             "out",
             "overwrite",
             "patch",

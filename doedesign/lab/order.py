@@ -53,6 +53,7 @@ def write_masks(
     direct_write: bool = False,
     formats: Formats | None = None,
     overwrite: bool = False,
+    one_to_one: bool = False,
     **geometry: Any,
 ) -> WrittenOrder:
     """Write and prove the mask order of a design or of any height map, with its run sheet.
@@ -72,6 +73,7 @@ def write_masks(
         direct_write: whether to write files for direct-write and greyscale exposure, too.
         formats: in which formats it is written; packed and coarse enough to mail by default.
         overwrite: where the folder has the order of another design, replace that order.
+        one_to_one: whether plates at 1:1 are taken for a stepper, too, from which a mask shop makes its reticles.
         geometry: of a bare height map: `step_m`, `etch_depths_m`, `pitch_m`, `scale_m`, `aperture_m`
             (`doedesign.runs.level_maps.drawing_from`).
 
@@ -111,6 +113,7 @@ def write_masks(
         papers=True,
         formats=formats,
         material=made_of,
+        one_to_one=one_to_one,
     )
     if order.repair is not None and design is not None:
         repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map)}

@@ -16,6 +16,7 @@ from fab.layout.structures import BAR_WIDTHS_UM
 from fab.order.drawing import DrawnOrder
 from fab.order.order import Order
 from fab.runsheet.page import html_page
+from fab.stock import reduction_of
 from fab.units import MM, NM, UM
 
 Values = dict[str, Any]
@@ -71,13 +72,18 @@ def _shared(order: Order) -> Values:
         "plate_thickness_mm": in_units(terms.blank_thickness_m, MM),
         "plate_flatness_um": in_units(terms.blank_flatness_m, UM),
         "orientation": f"{order.wafer.reading}; the data are not mirrored",
-        "scale": "1:1",
+        "scale": _scale(order),
         "data_grid_nm": in_units(order.dbu_m, NM),
         "address_grid_nm": in_units(terms.address_grid_m, NM),
         "cd_tolerance_nm": in_units(terms.cd_tolerance_m, NM),
         "registration_nm": in_units(terms.registration_m, NM),
         "defect_size_um": in_units(terms.defect_size_m, UM),
     }
+
+
+def _scale(order: Order) -> str:
+    reduction = reduction_of(order.process)
+    return "1:1" if reduction == 1 else f"1:1; the reticle is the cell of a die, {reduction} times as large"
 
 
 def _mask(drawing: DrawnOrder, photomask: Photomask, plates: Mapping[str, str], boxes: Mapping[Layer, Box]) -> Values:

@@ -25,7 +25,7 @@ from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair import Repair, repaired
 from fab.runsheet.tables import SILICA, Predictions
 from fab.solids.patch import Patch
-from fab.stock import STOCK, process_from
+from fab.stock import STOCK, process_from, reduction_of
 from fab.units import NM, UM, format_length
 
 if TYPE_CHECKING:
@@ -239,14 +239,23 @@ def plan_order(
     papers: bool = False,
     formats: Formats | None = None,
     material: str = SILICA,
+    one_to_one: bool = False,
 ) -> Order:
     """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`.
 
     Raises:
-        InputError: what `Order` refuses, a process of another staircase, or masks that it cannot print where that is to
-            fail.
+        InputError: what `Order` refuses, a process of another staircase, one that takes no plates at 1:1 unless those
+            are asked for, or masks that it cannot print where that is to fail.
     """
     made_by = process_from(process, level_map.levels)
+    if (reduction := reduction_of(made_by)) > 1 and not one_to_one:
+        rule = "must print plates at 1:1 by contact, a whole wafer at a time, which is what is drawn"
+        got = f'"{made_by.name}", whose reticles hold one die, {reduction} times as large'
+        cure = (
+            'Choose another process, such as "contact_aligner", or take plates at 1:1 by `one_to_one` and have the '
+            "mask shop enlarge the cell of a die."
+        )
+        raise InputError("process", rule, got, cure)
     wafer, terms = wafer or Wafer(), terms or OrderTerms()
     report = check(level_map, Rules.from_process(made_by, terms.address_grid_m))
     inside = level_map.level[level_map.relief.inside(level_map.grid)]

@@ -172,6 +172,7 @@ def write_order(
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
     formats: Formats | None = None,
+    one_to_one: bool = False,
 ) -> WrittenOrder:
     """Write a mask order and prove it; the folder appears only if the proof holds.
 
@@ -189,9 +190,11 @@ def write_order(
         on_violation: what to do where the process cannot print a mask: warn, fail, or fix the level map.
         waves_per_metre: waves of light per metre of height, for a repair (`fab.rules.repair.repair`).
         formats: in which formats it is written; packed and coarse enough to mail by default.
+        one_to_one: whether plates at 1:1 are taken for a stepper, too, from which a mask shop makes its reticles.
 
     Raises:
-        InputError: an argument is out of range; the folder holds anything else than an earlier order.
+        InputError: an argument is out of range; a stepper's reticles, which are not drawn; the folder holds anything
+            else than an earlier order.
         CheckFailed: what was read back differs; nothing is left at the final path.
     """
     order = plan_order(
@@ -206,6 +209,7 @@ def write_order(
         on_violation=on_violation,
         waves_per_metre=waves_per_metre,
         formats=formats,
+        one_to_one=one_to_one,
     )
     return write_planned(folder, order)
 

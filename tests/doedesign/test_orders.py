@@ -132,6 +132,16 @@ def test_the_order_of_a_height_map_may_be_drawn_again_and_is_told_by_its_file(pl
 
 
 @pytest.mark.usefixtures("work")
+def test_plates_for_a_stepper_are_written_where_they_are_asked_for(places: list[Path]):
+    code, _, said = call("masks", "runs/small", "--process", "stepper")
+    assert (code, places) == (2, [])
+    assert "plates at 1:1" in said
+    assert "by --one-to-one and" in said
+    call("masks", "runs/small", "--process", "stepper", "--one-to-one")
+    assert places == [Path("masks/small")]
+
+
+@pytest.mark.usefixtures("work")
 def test_an_order_is_made_of_the_material_of_its_design(tmp_path, monkeypatch):
     planned = []
     monkeypatch.setattr(lab, "write_planned", lambda folder, order, predict: planned.append(order))

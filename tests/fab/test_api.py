@@ -109,9 +109,10 @@ def test_a_check_draws_itself(process):
 
 def test_an_order_is_written_proved_and_shown(tmp_path):
     level_map = level_map_from(np.random.default_rng(0).integers(0, 16, (30, 30)), aperture_m=30 * UM, name="quick")
-    order = fab.write_order(tmp_path / "quick", level_map, process="stepper")
+    order = fab.write_order(tmp_path / "quick", level_map, process="stepper", one_to_one=True)
     assert order.order.process.name == "stepper"
     assert order.manifest.name == "quick"
+    assert "1:1; the reticle is the cell of a die, 5 times as large" in named(order.folder, "ORDER.csv").read_text()
     for report in (fab.verify(order), fab.verify(tmp_path / "quick"), fab.verify(str(order.folder))):
         assert report.passed
         report.require()

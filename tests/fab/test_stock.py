@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.order.order import plan_order
@@ -110,6 +111,9 @@ def test_numbers_are_those_of_a_cleanroom(stock: Stock):
 @pytest.mark.parametrize("name", sorted(STOCK))
 def test_an_order_for_a_process_without_contact_masks_says_so(name, caplog):
     plate = wide_map(np.zeros((8, 8), np.uint8), Levels(4, 300e-9), Grid((8, 8), 2e-6), "s")
-    plan_order(plate, process=name)
+    plan_order(plate, process=name, one_to_one=True)
     told = [message for message in caplog.messages if message.startswith(f"process {name}: ")]
-    assert len(told) == (name in ("stepper", "direct_write"))
+    assert len(told) == (name == "direct_write")
+    if name == "stepper":
+        with pytest.raises(InputError, match="reticles hold one die, 5 times as large"):
+            plan_order(plate, process=name)
