@@ -385,6 +385,10 @@ def _process(spec: Spec) -> Iterator[InputError]:
         rule = f"the DOE must lie on the wafer of radius {format_length(radius_m)}"
         cure = "Move the die inward or choose a larger process.wafer_radius."
         yield InputError("process.die", rule, f"a DOE that reaches {rounded(reach_m)} from its middle", cure)
+    stated = "diameter_m" in spec.wafer.model_fields_set and spec.process.wafer_radius_m is not None
+    if stated and abs(2 * radius_m - spec.wafer.diameter_m) > 1e-6:
+        rule = f"must be half of wafer.diameter, {format_length(spec.wafer.diameter_m)}"
+        yield InputError("process.wafer_radius", rule, format_length(radius_m), "Give one of them alone.")
     moves = spec.wafer.edge_moves_m
     if moves and len(moves) != process.masks:
         rule = f"must have one entry per mask, {process.masks} for {process.levels} levels"

@@ -1,4 +1,4 @@
-"""Parts that a spec may leave out because its task says them: scene, sensor, the steps of a design that is a formula.
+"""Parts that a spec may leave out because others say them: scene, sensor, the steps of a design that is a formula.
 
 A task is said by `[spots]`, `[area]`, `[focus]` or a classic start (`optimize.start = "axicon"`). What is left out then
 becomes part of the spec, as if it had been written, by these rules:
@@ -10,6 +10,9 @@ becomes part of the spec, as if it had been written, by these rules:
     sensor.pitch        half of what diffraction by the aperture can show, wavelength x distance / (2 x aperture), and
     or pixel_angle      as much in direction sines; wider where a window of 1024 pixels would not hold what is asked for
     sensor.window       what is asked for and a quarter more, at least 64 pixels; as far as cells steer light at most
+
+Whatever the task, the size of the wafer is stated once: `process.wafer_radius` is half of `wafer.diameter`, whichever
+of them is given.
 """
 
 import math
@@ -18,6 +21,7 @@ from typing import Any
 
 from doedesign.spec.errors import validated
 from doedesign.spec.models import Spec
+from doedesign.spec.process import RADII_M
 from doedesign.spec.targets.areas import AreaSpec
 from doedesign.spec.targets.spots import corners
 from doedesign.spec.values import STARTS, is_start
@@ -45,7 +49,7 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
     Raises:
         InputError: a mistake in what the spec says, which has to be right before the rest can follow from it.
     """
-    filled: dict[str, Any] = dict(raw)
+    filled: dict[str, Any] = dict(raw) | _one_wafer(raw)
     # A mistake in what says the task is told by itself, without all that would follow from it.
     aimed = any(name in raw for name in _AIMS)
     optimize, optics, sensor = (raw.get(name, {}) for name in ("optimize", "optics", "sensor"))
@@ -72,6 +76,25 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
         found = _sensor(spec, stand_in.keys()) if 0 < spec.image_distance_m < math.inf else stand_in
         filled["sensor"] = {**sensor, **found}
     return filled
+
+
+def _one_wafer(raw: Mapping[str, Any]) -> dict[str, Any]:
+    """The table that leaves out the size of the wafer, with that which the other one gives."""
+    process, wafer = raw.get("process", {}), raw.get("wafer", {})
+    if not (isinstance(process, Mapping) and isinstance(wafer, Mapping)):
+        return {}
+    if ("wafer_radius" in process) == ("diameter" in wafer):
+        return {}
+    given = process["wafer_radius"] if "wafer_radius" in process else wafer["diameter"]
+    try:
+        radius_m = parse_length(given) / (1 if "wafer_radius" in process else 2)
+    except ValueError:
+        return {}  # told where the table is read, and so is a length out of range
+    if not RADII_M[0] <= radius_m <= RADII_M[1]:
+        return {}
+    if "diameter" in wafer:
+        return {"process": {**process, "wafer_radius": f"{radius_m!r} m"}}
+    return {"wafer": {**wafer, "diameter": f"{2 * radius_m!r} m"}}
 
 
 def _is_classic(start: Any) -> bool:

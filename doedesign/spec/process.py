@@ -184,6 +184,9 @@ def _level_count(count: int) -> int:
     return count
 
 
+RADII_M = (0.5 * MM, 250 * MM)  # of wafers
+
+
 class ProcessSpec(SpecTable, frozen=True):
     """Levels that the fab lab makes, and how well.
 
@@ -202,7 +205,7 @@ class ProcessSpec(SpecTable, frozen=True):
         minimum_line_m: narrowest line the lithography prints.
         minimum_space_m: narrowest gap the lithography prints.
         die_m: where on the wafer the DOE lies (y, x).
-        wafer_radius_m: radius of the wafer.
+        wafer_radius_m: radius of the wafer, half of `wafer.diameter`; one of them is enough.
         errors: how far the process strays.
         defects: rare events.
     """
@@ -224,7 +227,7 @@ class ProcessSpec(SpecTable, frozen=True):
     minimum_line_m: Feature | None = optional(example='"1 um"')
     minimum_space_m: Feature | None = optional(example='"1 um"')
     die_m: tuple[Place, Place] | None = optional(example='["0 mm", "20 mm"]')
-    wafer_radius_m: Annotated[float, length(1 * MM, 1.0)] | None = optional(example='"50 mm"')
+    wafer_radius_m: Annotated[float, length(*RADII_M)] | None = optional(example='"50 mm"')
     errors: ErrorsSpec = optional(ErrorsSpec())
     defects: DefectsSpec = optional(DefectsSpec())
 

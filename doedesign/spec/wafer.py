@@ -9,7 +9,7 @@ from doedesign.spec.values.table import SpecTable, optional
 from fab.layout.wafer import Wafer
 from fab.units import MM, UM
 
-Size = Annotated[float, length(1 * MM, 0.5)]
+Size = Annotated[float, length(1 * MM, 500 * MM)]
 Thickness = Annotated[float, length(0.01 * MM, 50 * MM)]
 Rim = Annotated[float, length(0.0, 20 * MM)]
 Move = Annotated[float, length(-100 * UM, 100 * UM)]
@@ -22,7 +22,7 @@ class WaferSpec(SpecTable, frozen=True):
     """Wafer, mask blanks and dies; see `fab.layout.wafer.Wafer`.
 
     Attributes:
-        diameter_m: diameter of the wafer.
+        diameter_m: diameter of the wafer, twice `process.wafer_radius`; one of them is enough.
         thickness_m: thickness of the wafer.
         blank_m: edge of the square mask blanks.
         dies: rows and columns of dies; as many as fit if none are given.

@@ -268,6 +268,7 @@ def plan_order(
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
     asked: dict[str, Any] = {"patch": patch, "terms": terms, "papers": papers, "direct_write": direct_write}
     asked |= {"formats": formats or Formats(), "material": material}
+    _require_one_wafer(made_by, wafer)
     order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
     if made_by.name in STOCK and (said := STOCK[made_by.name].not_drawn):
         log.warning("process %s: %s", made_by.name, said)
@@ -297,6 +298,14 @@ def plan_order(
     if patch is not None:
         patch.require(order.level_map)
     return order
+
+
+def _require_one_wafer(process: Process, wafer: Wafer) -> None:
+    """Check that the process, whose depths differ over the wafer, has its DOE on the wafer that is ordered."""
+    if any(process.die_m) and abs(2 * process.wafer_radius_m - wafer.diameter_m) > 1 * UM:
+        rule = f"must be half of the diameter of the wafer that is ordered, {format_length(wafer.diameter_m)}"
+        cure = "Say where on this wafer the DOE lies, or order the wafer of the process."
+        raise InputError("process: wafer_radius_m", rule, format_length(process.wafer_radius_m), cure)
 
 
 def plain_name(name: str) -> str:

@@ -91,6 +91,16 @@ def test_every_error_of_the_process_model_has_its_key():
     assert all(field.alias and not field.alias.endswith(("_m", "_rad")) for field in ErrorsSpec.model_fields.values())
 
 
+def test_the_size_of_the_wafer_is_stated_once():
+    for stated in ('wafer.diameter="150 mm"', 'process.wafer_radius="75 mm"'):
+        spec = load_spec(AUTOMOTIVE, [stated])
+        assert (process_from_spec(spec.process).wafer_radius_m, spec.wafer.diameter_m) == (0.075, 0.15)
+    both = ['process.wafer_radius="50 mm"', 'wafer.diameter="150 mm"']
+    message = refusal(load_spec, AUTOMOTIVE, both)
+    assert "process.wafer_radius: must be half of wafer.diameter, 150 mm, but got 50 mm" in message
+    assert load_spec(AUTOMOTIVE, ['wafer.diameter="100 mm"', 'process.wafer_radius="50 mm"'])
+
+
 def test_a_process_in_full(written: Callable[..., Path]):
     spec = load_process(written("[process]" + FULL))
     process = process_from_spec(spec)
@@ -245,6 +255,8 @@ REFUSED = [
     ("process.die", '["1 mm"]', ["process.die[1]: must be given"]),
     ("process.die", '["0 mm", "48 mm"]', ["process.die: the DOE must lie on the wafer of radius 50 mm", "50.22 mm"]),
     ("process.wafer_radius", '"2 mm"', ["process.die: the DOE must lie on the wafer of radius 2 mm"]),
+    ("process.wafer_radius", '"1 m"', ["process.wafer_radius: must lie between 500 um and 250 mm"]),
+    ("wafer", '{diameter = "1 um"}', ["wafer.diameter: must lie between 1 mm and 500 mm"]),
     ("process.minimum_line", '"2 mm"', ["process.minimum_line: ", "between 0 nm and 1 mm"]),
     ("process.defects.missed", "1.2", ["process.defects.missed: ", "between 0 and 1", "1.2"]),
     ("process.defects", "{missed = 0.6, doubled = 0.6}", ["sum to at most 1", "0.6 + 0.6"]),

@@ -18,6 +18,7 @@ from fab.manifest.records import read_manifest
 from fab.order.order import plain_name, plan_order
 from fab.order.terms import OrderTerms
 from fab.order.write import write_order
+from fab.process import Process
 from fab.units import UM
 from fab.verification.files import read_drawn_levels
 from tests.fab.maps import FEW, PLAIN, SMALL, level_map_from, wide_map
@@ -212,6 +213,15 @@ def test_the_longest_names_fit_thirty_two_characters(pitch_m, step_m):
     assert order.stem.startswith("A_V")
     assert max(len(order.mask_stem(bit)) for bit in range(4)) <= 32
     assert len(f"{order.stem}_ORDER_DIE") <= 32
+
+
+def test_the_process_has_its_doe_on_the_wafer_that_is_ordered(level_map):
+    wafer, process = Wafer(150e-3, blank_m=178e-3), Process(level_map.levels, die_m=(0.0, 30e-3))
+    with pytest.raises(InputError, match=r"wafer_radius_m: must be half of .* that is ordered, 150 mm, but got 50 mm"):
+        plan_order(level_map, process=process, wafer=wafer)
+    assert plan_order(level_map, process=replace(process, wafer_radius_m=75e-3), wafer=wafer)
+    # In the middle of the wafer its size does not matter.
+    assert plan_order(level_map, process=replace(process, die_m=(0.0, 0.0)), wafer=wafer)
 
 
 def test_floors_leave_glass_below_them(level_map, caplog):
