@@ -1,8 +1,8 @@
 """Predictions on a run sheet: the light of the DOE, the test gratings, and which measured number matters most.
 
 The ranking is the tolerance analysis of one error at a time, on a patch of the design: Strehl ratio and 0th order are
-means over the DOE, and a patch half way to the rim has them about as the whole DOE does. Errors of the chrome are not
-in it.
+means over the DOE, and a patch half way to the rim has them about as the whole DOE does. What of it is open counts;
+where that is less than half of it, the patch lies where most is open. Errors of the chrome are not in it.
 """
 
 import math
@@ -20,12 +20,14 @@ from doedesign.design.design import Design
 from doedesign.prediction import Prediction, plate_rows, predict
 from doedesign.tolerancing.analysis import sample_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
+from fab.aperture import MaskAperture
 from fab.draws import EXPECTED, one_at_a_time_keys, variation_at, varying
 from fab.errors import InputError
 from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.process import Normal, Process, Variation, deviation_of
 from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions, SheetPrediction
+from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.material import full_wave_wavelength_m, refractive_index
 from sim.metrics import strehl, zeroth_order
@@ -64,16 +66,36 @@ def grating_orders(
     return float(orders[np.argmax(depths_m)]), float(np.prod(orders))
 
 
+def _place_of_patch(coverage: NDArray[np.float32], side: int) -> tuple[int, int]:
+    """First row and column of a patch: the middle of the right half, or where most is open if half of that is not."""
+    ny, nx = coverage.shape
+    usual = (ny - side) // 2, min(nx - side, 3 * nx // 4 - side // 2)
+    step = max(1, side // 2)
+    rows, columns = ([*range(0, n - side, step), n - side] for n in (ny, nx))
+    sums = np.pad(coverage, ((1, 0), (1, 0))).cumsum(0, np.float64).cumsum(1)
+
+    def opened(y0: int, x0: int) -> float:
+        y1, x1 = y0 + side, x0 + side
+        return sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
+
+    if opened(*usual) >= side**2 / 2:
+        return usual
+    return max(((y0, x0) for y0 in rows for x0 in columns), key=lambda place: opened(*place))
+
+
 def _patch(design: Design, process: Process) -> tuple[NDArray[np.uint8], Camera, Process]:
-    """The middle of the right half of a design, its camera, and the process with the place where it lies."""
-    ny, nx = design.level_map.level.shape
-    side = min(_PATCH, ny, nx // 2)
-    y0, x0 = (ny - side) // 2, min(nx - side, 3 * nx // 4 - side // 2)
+    """A patch of a design, its camera, and the process with the place where it lies."""
     camera, pitch_m = design.camera, design.camera.grid.pitch_m
+    coverage = open_cells(camera.grid, camera.aperture)
+    ny, nx = coverage.shape
+    side = min(_PATCH, ny, nx // 2)
+    y0, x0 = _place_of_patch(coverage, side)
     off = ((y0 + (side - ny) / 2) * pitch_m, (x0 + (side - nx) / 2) * pitch_m)
     die_m = (process.die_m[0] + off[0], process.die_m[1] + off[1])
-    # An opening beyond the corners, so that every cell counts alike.
-    small = replace(camera, grid=Grid((side, side), pitch_m), aperture=2 * side * pitch_m)
+    opened = coverage[y0 : y0 + side, x0 : x0 + side] >= 0.5
+    # Where all of it is open, an opening beyond the corners is the same and takes less time.
+    aperture = 2 * side * pitch_m if opened.all() else MaskAperture.of(opened, pitch_m)
+    small = replace(camera, grid=Grid((side, side), pitch_m), aperture=aperture)
     level = np.ascontiguousarray(design.level_map.level[y0 : y0 + side, x0 : x0 + side])
     on_wafer = max(process.wafer_radius_m, math.hypot(*die_m))
     return level, small, replace(process, die_m=die_m, wafer_radius_m=on_wafer)

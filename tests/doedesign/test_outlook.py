@@ -12,6 +12,7 @@ from doedesign.build import with_edge_moves
 from doedesign.design.design import Design
 from doedesign.lab.predictions import grating_orders, predict_sheet, rank_importance
 from doedesign.prediction import predict
+from fab.aperture import MaskAperture
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
@@ -123,6 +124,30 @@ def test_compensated_masks_bring_the_expected_plate_back(design):
     for a, b in zip(predictions.drawn, predictions.expected, strict=True):
         assert b.strehl == pytest.approx(a.strehl, abs=1e-5)
     assert predict_sheet(design, process, 550e-9).predictions.expected[0].strehl < 0.99
+
+
+def test_what_is_closed_does_not_count(design):
+    pattern = np.tile(np.random.default_rng(3).integers(0, 16, (8, 8)), (8, 8)).astype(np.uint8)
+
+    def ranked(level: np.ndarray, plane: np.ndarray, *errors: str) -> list[tuple[float, ...]]:
+        aperture = MaskAperture.of(plane, CAMERA.grid.pitch_m)
+        level_map = LevelMap(level, LEVELS, CAMERA.grid, aperture, "holes")
+        process = Process(LEVELS, spreads=dict(zip(errors, (Normal(0.0, 0.04), Normal(0.0, 0.1)), strict=True)))
+        found = rank_importance(Design(level_map, replace(CAMERA, aperture=aperture), (), (np.inf,)), process, 550e-9)
+        return [one[1:] for one in sorted(found)]
+
+    # Depths leave walls where they are, so that whole periods of a pattern that are missing change nothing.
+    holes = np.ones(CAMERA.grid.shape, bool)
+    holes[16:32, 40:64] = False
+    depths = "depth_scale[3]", "depth_scale[1]"
+    wanted = ranked(pattern, np.ones_like(holes), *depths)
+    np.testing.assert_allclose(ranked(pattern, holes, *depths), wanted, atol=1e-4)  # sums in single precision
+    # A plate whose right half is closed is looked at where it is open.
+    left = np.zeros_like(holes)
+    left[8:56, 8:24] = True
+    right, level = np.roll(left, 32, axis=1), np.roll(design.level_map.level, 32, axis=1)
+    wanted = ranked(level, right, "depth_scale[3]", "depth_scale[0]")
+    assert ranked(design.level_map.level, left, "depth_scale[3]", "depth_scale[0]") == wanted
 
 
 @pytest.mark.slow
