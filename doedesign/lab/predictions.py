@@ -20,7 +20,7 @@ from doedesign.design.design import Design
 from doedesign.prediction import Prediction, plate_rows, predict
 from doedesign.tolerancing.analysis import sample_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
-from fab.aperture import MaskAperture
+from fab.aperture import MaskAperture, RoundAperture
 from fab.draws import EXPECTED, one_at_a_time_keys, variation_at, varying
 from fab.errors import InputError
 from fab.figure import png_bytes
@@ -86,7 +86,7 @@ def _place_of_patch(coverage: NDArray[np.float32], side: int) -> tuple[int, int]
 def _patch(design: Design, process: Process) -> tuple[NDArray[np.uint8], Camera, Process]:
     """A patch of a design, its camera, and the process with the place where it lies."""
     camera, pitch_m = design.camera, design.camera.grid.pitch_m
-    coverage = open_cells(camera.grid, camera.aperture)
+    coverage = open_cells(camera.grid, camera.opening)
     ny, nx = coverage.shape
     side = min(_PATCH, ny, nx // 2)
     y0, x0 = _place_of_patch(coverage, side)
@@ -94,7 +94,7 @@ def _patch(design: Design, process: Process) -> tuple[NDArray[np.uint8], Camera,
     die_m = (process.die_m[0] + off[0], process.die_m[1] + off[1])
     opened = coverage[y0 : y0 + side, x0 : x0 + side] >= 0.5
     # Where all of it is open, an opening beyond the corners is the same and takes less time.
-    aperture = 2 * side * pitch_m if opened.all() else MaskAperture.of(opened, pitch_m)
+    aperture = RoundAperture(2 * side * pitch_m) if opened.all() else MaskAperture.of(opened, pitch_m)
     small = replace(camera, grid=Grid((side, side), pitch_m), aperture=aperture)
     level = np.ascontiguousarray(design.level_map.level[y0 : y0 + side, x0 : x0 + side])
     on_wafer = max(process.wafer_radius_m, math.hypot(*die_m))

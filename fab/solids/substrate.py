@@ -140,7 +140,7 @@ class ChromeFilm:
         if isinstance(self.opening, RoundAperture) and not self.edge_m:
             area = math.pi * (self.outer_m + self.opening.reach_m) * (self.outer_m - self.opening.reach_m)
         # What is taken from the film moves its centre away.
-        x, y = (-math.fsum(part[0] * part[axis] for part in gone) / area for axis in (1, 2))
+        x, y = ((0.0 - math.fsum(part[0] * part[axis] for part in gone)) / area for axis in (1, 2))
         return Body(area * self.thickness_m, (x, y, self.thickness_m / 2))
 
     def solid(self) -> Any:
