@@ -46,10 +46,12 @@ class _Box(NamedTuple):
     height: float
 
     def lies_on(self, wafer: Wafer) -> bool:
-        """Whether all of it can be used on a wafer: inside the edge exclusion, and away from the flat."""
-        reach = math.hypot(abs(self.x) + self.width / 2, abs(self.y) + self.height / 2)
-        rim = wafer.edge_exclusion_m
-        return reach <= wafer.diameter_m / 2 - rim + 1e-12 and self.y - self.height / 2 >= -wafer.flat_y_m + rim - 1e-12
+        """Whether all of it can be used on a wafer: inside the edge exclusion, and away from the flat or the notch."""
+        reach, low = math.hypot(abs(self.x) + self.width / 2, abs(self.y) + self.height / 2), self.y - self.height / 2
+        radius, rim, notch = wafer.diameter_m / 2, wafer.edge_exclusion_m, wafer.notch_m
+        # A notch is as wide to either side as it is deep, and mostly less deep than the rim.
+        over_notch = abs(self.x) - self.width / 2 < notch and low < notch - radius
+        return reach <= radius - rim + 1e-12 and low >= -wafer.flat_y_m + rim - 1e-12 and not over_notch
 
     def meets(self, other: "_Box") -> bool:
         """Whether two boxes are closer than the gap that they need."""

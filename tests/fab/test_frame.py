@@ -224,6 +224,12 @@ def test_the_first_photomask_shows_where_the_flat_or_the_notch_belongs(diameter_
         assert gaps == [y - 50_000] * 2 + [y + 50_000] * 2
 
 
+def test_no_die_lies_over_the_notch():
+    frame = framed(Wafer(diameter_m=0.2, blank_m=0.2286, edge_exclusion_m=0.0, pitch_m=6.87e-3), chrome_m=4e-3)
+    lowest = [(x, y - frame.die_m / 2) for x, y in frame.dies if abs(x) < frame.die_m / 2 + 1e-3]
+    assert -0.099 <= min(y for _, y in lowest) < -0.092
+
+
 def test_marks_at_the_notch_are_as_long_as_the_blank_has_room():
     def lengths(blank_m):
         wafer = Wafer(diameter_m=0.2, blank_m=blank_m)
