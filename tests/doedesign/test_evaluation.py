@@ -316,7 +316,6 @@ CAPTURES = {"capture_fabricated", "robust_capture", "robust_capture_fabricated"}
 # Rows of `later/captures` that are of another run than their table; of dirt under the reciprocal model they are of the
 # very trainings of it, looked at again. Optics alone are joined where theirs were of a run that was not kept.
 JOINED_CAPTURES = {
-    "table2-dirt-radiometric": CAPTURES | {"optics_only_fabricated"},
     "table2-dirt-reciprocal": set(),
     "table2-fence-paper": CAPTURES,
     "table2-fence-radiometric": CAPTURES,

@@ -168,7 +168,7 @@ def test_a_psf_has_the_derivative_of_its_plate():
     @jax.jit
     @jax.value_and_grad
     def energy(step: jax.Array) -> jax.Array:
-        optic = HeightOptic(CAMERA, open_ - step[1] * closing, None, (at + step[0] * toward,))
+        optic = HeightOptic(CAMERA, open_ - step[1] * closing, None, {line.wavelength_m: at + step[0] * toward})
         return jnp.sum(weights * optic.energy(line, plan, source))
 
     slopes = np.asarray(energy(jnp.zeros(2))[1])

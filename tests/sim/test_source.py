@@ -50,7 +50,7 @@ def test_deviations_of_a_doe_multiply_its_transmission() -> None:
     source = SeparableSource.at(optics, line.wavelength_m, 0.08)
     ones = jnp.ones((96, 96))
     factor = 0.5 * jnp.exp(1j * ones)
-    both = (factor, ones + 0j)
+    both = {line.wavelength_m: factor} | {other.wavelength_m: ones + 0j for other in optics.lines[1:]}
     plain, deviating = HeightOptic(optics, ones, 0 * ones), HeightOptic(optics, ones, 0 * ones, both)
     found, wanted = (jax.jit(doe_field)(*doe.rows(line, source)) for doe in (deviating, plain))
     np.testing.assert_allclose(found, factor * wanted, atol=1e-6)
