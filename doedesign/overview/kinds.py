@@ -69,7 +69,9 @@ def record_of(folder: Path) -> Record:
         kind = _kind(str(study.get("format"))) or "study"
         # An evaluation has no manifest; its table is written last.
         done = kind == "evaluation" and (folder / TABLE_NAME).is_file()
-        return Record(kind, str(study.get("design", folder.name)), study, done)
+        design = study.get("design")
+        name = design.get("name") if isinstance(design, dict) else design  # a study of plates tells more of it
+        return Record(kind, str(name or folder.name), study, done)
     if not folder.is_dir():
         got = "a file" if folder.exists() else "nothing"
         raise InputError(str(folder), "must be a folder of results", got, "Check the path.")

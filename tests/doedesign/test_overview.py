@@ -174,6 +174,17 @@ def test_a_folder_that_must_not_be_read_is_listed_as_such(tmp_path: Path, monkey
     assert "Permission denied" in found["closed"].about
 
 
+@pytest.mark.parametrize(
+    ("design", "name"), [("small", "small"), ({"name": "small", "shape": [8, 8]}, "small"), ({}, "study"), (None, "study")]
+)
+def test_a_study_has_the_name_of_its_design(tmp_path: Path, design: object, name: str):
+    """Studies of plates tell more of it than its name."""
+    study = tmp_path / "study"
+    study.mkdir()
+    (study / "study.json").write_bytes(canonical_json({"format": "doedesign tolerance draws 1", "design": design}))
+    assert record_of(study).name == name
+
+
 def test_results_inside_a_run_are_listed_under_it(tmp_path: Path):
     run = written(tmp_path / "run")
     inside = run / "tolerance"
