@@ -175,7 +175,8 @@ def test_a_folder_that_must_not_be_read_is_listed_as_such(tmp_path: Path, monkey
 
 
 @pytest.mark.parametrize(
-    ("design", "name"), [("small", "small"), ({"name": "small", "shape": [8, 8]}, "small"), ({}, "study"), (None, "study")]
+    ("design", "name"),
+    [("small", "small"), ({"name": "small", "shape": [8, 8]}, "small"), ({}, "study"), (None, "study")],
 )
 def test_a_study_has_the_name_of_its_design(tmp_path: Path, design: object, name: str):
     """Studies of plates tell more of it than its name."""
