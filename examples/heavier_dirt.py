@@ -13,7 +13,7 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -59,8 +59,12 @@ class Row(NamedTuple):
 
 def in_display_values(scene: Scene) -> Scene:
     """The scene with display values in the place of light."""
-    layers = tuple(Obstruction(o.mask, srgb_from_linear(o.radiance), o.depth_m) for o in scene.obstructions)
-    return Scene(srgb_from_linear(scene.background), scene.background_depth_m, layers)
+
+    def shown(light: Any) -> np.ndarray:
+        return srgb_from_linear(np.asarray(light))
+
+    layers = tuple(Obstruction(o.mask, shown(o.radiance), o.depth_m) for o in scene.obstructions)
+    return Scene(shown(scene.background), scene.background_depth_m, layers)
 
 
 def compare(run: Path, files: Sequence[Path], dirt: str, pairs: int, *, display: bool) -> Row:
@@ -86,9 +90,9 @@ def compare(run: Path, files: Sequence[Path], dirt: str, pairs: int, *, display:
             found[k, 1, number] = psnr(shown, wanted)[0]
     within = [list(scores[0]) for scores in found]
     gain = paired_difference(within[1], within[0])
-    means = [mean_and_interval(list(scores)).mean for camera_scores in found for scores in camera_scores]
-    values = "display values" if display else "linear light"
-    return Row(dirt, values, float(np.mean(covered)), *means, gain.mean, gain.low, gain.high)
+    plain, plain_full, plate, plate_full = (mean_and_interval(list(one)).mean for one in found.reshape(4, pairs))
+    values, share = "display values" if display else "linear light", float(np.mean(covered))
+    return Row(dirt, values, share, plain, plain_full, plate, plate_full, gain.mean, gain.low, gain.high)
 
 
 def main() -> int:
