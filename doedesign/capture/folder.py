@@ -32,7 +32,7 @@ from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import plain_parameters
 from doedesign.capture.image_files import read_image, write_image
 from doedesign.capture.images import Pictures, picture_files
-from doedesign.capture.scenes import SceneData
+from doedesign.capture.scenes import SceneData, require_seed
 from doedesign.capture.simulate import Psfs, SimulatedCapture, Stage, flat_psfs, photograph, psfs_by_depth
 from doedesign.design.design import Design
 from doedesign.report.sheet import ContactRow, plot_contact
@@ -114,8 +114,7 @@ def simulate_files(
     kind, model, view, far_m = Stage.of(design, obstruction, occlusion, size)
     pictures = Pictures(picture_files(images), most_px=2 * max(view.shape))
     count = min(_USUAL_COUNT, len(pictures)) if count is None else count
-    if not 0 <= seed < 1 << 32:
-        raise InputError("seed", "must be from 0 to 4294967295", seed, "For example 0.")
+    require_seed(seed)
     if count < 1:
         raise InputError("count", "must be at least 1", count, "Leave it out for one item per picture, at most six.")
     data = SceneData(pictures, kind, view, far_m, seed, mirrored=False)

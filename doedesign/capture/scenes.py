@@ -25,8 +25,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from doedesign.capture.images import Picture, Pictures, crop, linear_light, zoomed
+from fab.errors import InputError
 from sim.imaging.scene import Scene
 from sim.obstruction import CameraView, ObstructionKind
+
+
+def require_seed(seed: int) -> None:
+    """Refuse a seed that scenes and their noise cannot be drawn by.
+
+    Args:
+        seed: the seed.
+
+    Raises:
+        InputError: it is negative, or beyond 32 bits.
+    """
+    if not 0 <= seed < 1 << 32:
+        raise InputError("seed", "must be from 0 to 4294967295", seed, "For example 0.")
 
 
 class NamedScene(NamedTuple):

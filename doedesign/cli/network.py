@@ -252,8 +252,11 @@ def evaluate(
         idle |= {"pairs": pairs, "images": images, "test": test, "licence": licence, "train": train, "seeds": seeds}
         idle |= {"reflect": reflect, "robust": robust, "method": method, "lpips_weights": lpips_weights}
         idle |= {"workers": workers, "scheduler": scheduler, "set_": set_}
-        cure = "Leave it out: --figure takes --process, --draws, --seed and --out."
+        cure = "Leave it out: --figure 8 takes --process, --draws and --seed, bench --process and --seed, all --out."
         refuse_options(evaluate, idle, "is of tables and does not go with --figure", cure)
+        plates: dict[str, object] = {"draws": draws} if figure == "bench" else {}
+        plates |= {"process": process, "draws": draws, "seed": seed} if figure == "4" else {}
+        refuse_options(evaluate, plates, f"does not go with --figure {figure}", cure)
         from doedesign.evaluation.optics.figures import figure as draw
 
         with measured(run, "evaluate", writes=folder) as taken:

@@ -25,6 +25,7 @@ import numpy as np
 
 from doedesign.capture.from_spec import plain_parameters
 from doedesign.capture.images import PICTURE_FILES, picture_files, sample_files
+from doedesign.capture.scenes import require_seed
 from doedesign.design.design import Design
 from doedesign.evaluation.candidates import Candidate, Unscored, candidates_of
 from doedesign.evaluation.external import GIVEN, ExternalMethod, file_of, read_pair, run_program, write_pair
@@ -121,8 +122,7 @@ def evaluate(
     for name, value in (("pairs", pairs), ("draws", draws), ("seeds", len(seeds))):
         if value < 1:
             raise InputError(name, "must be at least 1", value, "Give one or more.")
-    if not 0 <= seed < 1 << 32:
-        raise InputError("seed", "must be from 0 to 4294967295", seed, "For example 0.")
+    require_seed(seed)
     run, programs = Path(source), [ExternalMethod.parse(text) for text in methods]
     folder = run / "evaluation" if out is None else Path(out)
     with stoppable():

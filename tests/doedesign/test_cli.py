@@ -116,6 +116,8 @@ def test_closed_streams_are_nothing_to_stumble_over(tmp_path: Path, closed: str)
         (("simulate", "run", "--draw", "normal/3"), "--draw: must be given with --plate-seed"),
         (("evaluate", "run", "--figure", "4", "--table", "1"), "--table: is of tables"),
         (("evaluate", "run", "--figure", "4", "--train"), "--train: is of tables"),
+        (("evaluate", "run", "--figure", "4", "--seed", "2"), "--seed: does not go with --figure 4"),
+        (("evaluate", "run", "--figure", "bench", "--draws", "2"), "--draws: does not go with --figure bench"),
         (("evaluate", "run", "--figure", "4", "--set", "train.steps=1"), "--set: is of tables"),
         (("evaluate", "run", "--figure", "8", "--lpips-weights", "a.npz"), "--lpips-weights: is of tables"),
         (("report", "run", "--compare", "other", "--order", "masks"), "--order: does not go with other runs"),
