@@ -1,12 +1,15 @@
 """The command line, a file for each family of commands.
 
 Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted. Heavy packages are imported where they are used, so
-that --help answers at once.
+that --help and the commonest mistakes are answered at once.
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from inspect import signature
+from pathlib import Path
+from typing import Any
 
 from cyclopts import App, Group
 
@@ -65,10 +68,27 @@ _USAGE = {
     "show": "Usage: doedesign show [OPTIONS] FOLDER [WHAT]",
     "compare": "Usage: doedesign compare [OPTIONS] FOLDER FOLDER...",
 }
+
+
+def _run_first(command: Callable[..., None]) -> Callable[..., None]:
+    """The command; if it works on a run, it asks whether there is one before it loads heavy packages."""
+    if "run" not in signature(command).parameters:
+        return command
+
+    @wraps(command)
+    def checked(run: Path, *given: Any, **options: Any) -> None:
+        from doedesign.runs.folder import require_folder
+
+        require_folder(run)
+        command(run, *given, **options)
+
+    return checked
+
+
 for _command in _COMMANDS:
     _name = _command.__name__
     app.command(
-        with_groups(_command),
+        _run_first(with_groups(_command)),
         usage=_USAGE.get(_name),
         group=stage_of(_name),
         sort_key=place_of(_name),

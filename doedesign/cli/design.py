@@ -63,15 +63,16 @@ def optimize(
         overwrite: Where the folder has the run of another spec, remove it and all that was made of it.
         allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
     """
-    from doedesign.design.objectives import import_objectives
-    from doedesign.optimization import optimize as work
-    from doedesign.optimization import steps_within
-    from doedesign.runs.costs import measured
     from doedesign.spec import load_spec
 
     if start is not None:
         set_ = (*set_, f"optimize.start={start}")
-    read = load_spec(spec, set_)
+    read = load_spec(spec, set_)  # a mistake in it is told before heavy packages are loaded
+    from doedesign.design.objectives import import_objectives
+    from doedesign.optimization import optimize as work
+    from doedesign.optimization import steps_within
+    from doedesign.runs.costs import measured
+
     folder = out or Path("runs") / read.name
     own = import_objectives(read) if allow_code else None
     with measured(folder, "optimize") as taken:
@@ -228,6 +229,9 @@ def masks(
     if probe is not None and not source.is_dir():
         rule = "goes with a run, which says what light and what glass"
         raise InputError("--probe", rule, f"{probe} for {source}", "Leave it out.")
+    from doedesign.runs.folder import require_relief
+
+    require_relief(source)  # before heavy packages are loaded
     from doedesign.lab.order import PROBE_M, drawn_as, write_masks
     from doedesign.runs.costs import measured
     from fab.order.formats import Formats
@@ -288,9 +292,9 @@ def verify(order: Path, *, json_: AsJson = False) -> None:
     Args:
         order: Folder that masks wrote.
     """
+    _require_order(order)
     from fab.order.verify import verify as work
 
-    _require_order(order)
     report = work(order)
     if json_:
         checks = [{"file": c.file, "question": c.question, "problems": list(c.problems)} for c in report.checks]
@@ -303,7 +307,11 @@ def verify(order: Path, *, json_: AsJson = False) -> None:
 
 
 def _require_order(folder: Path) -> None:
-    """Refuse a run where its mask order is wanted, and propose that."""
+    """Refuse what is no folder, and a run where its mask order is wanted, and propose that."""
+    rule = "must be the folder of a mask order"
+    if not folder.is_dir():
+        got = "a file" if folder.exists() else "no folder"
+        raise InputError(str(folder), rule, got, "Draw one with: doedesign masks RUN")
     from doedesign.overview.kinds import record_of
     from doedesign.runs.orders import is_made_from, order_of_run, own_level_map
     from fab.files import MANIFEST_NAME
@@ -315,7 +323,7 @@ def _require_order(folder: Path) -> None:
     place = order_of_run(record.name, folder, own)
     draw = f"Draw its order first: doedesign {shlex.join(words_to_draw(record.name, folder))}."
     cure = f"Give its order: {place}." if own is not None and is_made_from(place, own) else draw
-    raise InputError(str(folder), "must be the folder of a mask order", "a run", cure)
+    raise InputError(str(folder), rule, "a run", cure)
 
 
 def _patch(step: str | None, mesh: str | None) -> Any:

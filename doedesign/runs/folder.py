@@ -37,6 +37,7 @@ from pydantic import BaseModel, ValidationError
 
 from doedesign import __version__
 from doedesign.spec import (
+    HEIGHT_FILES,
     Spec,
     input_files,
     kept_pictures,
@@ -340,9 +341,7 @@ def open_run(folder: Path) -> Run:
         InputError: no run, an unfinished one, one without a DOE, or one whose spec or height map changed since it was
             made.
     """
-    if not folder.is_dir():
-        got = "a file" if folder.exists() else "no folder"
-        raise InputError(str(folder), "must be a run folder", got, "Make one with: doedesign optimize SPEC")
+    require_folder(folder)
     if not (folder / MANIFEST_NAME).is_file():
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
     _require_no_order(folder)
@@ -367,6 +366,37 @@ def open_run(folder: Path) -> Run:
         process = spec_to_json(spec)["process"] | {_DEPTHS: manifest.etch_depths_m}
         spec = spec_from_json(spec_to_json(spec) | {"process": process}, str(folder / MANIFEST_NAME))
     return Run(folder, spec, done=True, aim_depths_m=manifest.aim_depths_m)
+
+
+def require_folder(run: Path) -> None:
+    """Refuse what cannot be a run, for it is no folder.
+
+    Args:
+        run: what should be the folder of a run.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    if not run.is_dir():
+        got = "a file" if run.exists() else "no folder"
+        raise InputError(str(run), "must be a run folder", got, "Make one with: doedesign optimize SPEC")
+
+
+def require_relief(source: Path) -> None:
+    """Refuse what cannot have a relief to draw: nothing, or a spec.
+
+    Args:
+        source: what should be the folder of a run or a height map.
+
+    Raises:
+        InputError: there is nothing of that name, or it is a spec.
+    """
+    rule = f"must be a run folder or a height map ({', '.join(HEIGHT_FILES)})"
+    if not source.exists():
+        raise InputError(str(source), rule, "nothing of that name", "Check the path.")
+    if source.suffix.lower() == ".toml":
+        cure = f"Optimise it first, and give its run: doedesign optimize {source}."
+        raise InputError(str(source), rule, "a spec", cure)
 
 
 def _require_no_order(folder: Path) -> None:

@@ -10,7 +10,16 @@ import numpy as np
 
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
-from doedesign.runs.folder import CAPTURE_TABLES, CONTINUOUS, HEIGHT, LEVEL_MAP, Run, open_run, spec_with
+from doedesign.runs.folder import (
+    CAPTURE_TABLES,
+    CONTINUOUS,
+    HEIGHT,
+    LEVEL_MAP,
+    Run,
+    open_run,
+    require_relief,
+    spec_with,
+)
 from doedesign.runs.orders import own_order, require_order_of
 from doedesign.spec import HEIGHT_FILES
 from fab.aperture import Aperture, aperture_from
@@ -176,12 +185,8 @@ def drawing_from(
     """
     if isinstance(source, str):
         source = Path(source)
-    if isinstance(source, Path) and not source.exists():
-        raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
-    if isinstance(source, Path) and source.suffix.lower() == ".toml":
-        rule = f"must be a run folder or a height map ({', '.join(HEIGHT_FILES)})"
-        cure = f"Optimise it first, and give its run: doedesign optimize {source}."
-        raise InputError(str(source), rule, "a spec", cure)
+    if isinstance(source, Path):
+        require_relief(source)
     if not isinstance(source, Path) or source.is_dir():
         geometry = {"step_m": step_m, "etch_depths_m": etch_depths_m or None, "pitch_m": pitch_m, "scale_m": scale_m}
         for name, value in {**geometry, "aperture_m": aperture_m}.items():

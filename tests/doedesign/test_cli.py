@@ -62,6 +62,22 @@ def test_help_loads_nothing_heavy():
     assert done.stdout.splitlines()[-1] == ""
 
 
+def test_common_mistakes_load_nothing_heavy(tmp_path: Path):
+    """A wrong path or key is told before the packages that the work would need are loaded."""
+    (tmp_path / "spec.toml").write_bytes((ROOT / "examples/quick.toml").read_bytes())
+    names = {each: {argument.name for argument in app[each].assemble_argument_collection()} for each in COMMANDS}
+    more = {"finetune": ["--pairs", "none"]}
+    mistakes = [[each, "none", *more.get(each, [])] for each in COMMANDS if "--run" in names[each]]
+    assert len(mistakes) > 10
+    mistakes += [["verify", "none"], ["masks", "none"], ["masks", "spec.toml"]]
+    mistakes += [["optimize", "none.toml"], ["optimize", "spec.toml", "--set", "optimize.stepz=3"]]
+    calls = "; ".join(f"assert main({each}) == 2" for each in mistakes)
+    check = f"import sys; from doedesign.cli import main; {calls}; print(*({{'jax', 'numba'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.split() == []
+    assert done.stderr.count(", but got ") == len(mistakes)
+
+
 def test_version(capsys: pytest.CaptureFixture[str]):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.strip() == __version__
@@ -129,7 +145,11 @@ def test_closed_streams_are_nothing_to_stumble_over(tmp_path: Path, closed: str)
         (("tolerance", "run", "--draw", "normal/3", "--out", "there"), "--out: must be left out with --draw"),
     ],
 )
-def test_options_that_would_do_nothing_are_refused(command: tuple[str, ...], words: str):
+def test_options_that_would_do_nothing_are_refused(
+    command: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("run").mkdir()
     code, _, said = call(*command)
     assert code == 2
     assert words in said
