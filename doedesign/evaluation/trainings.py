@@ -1,10 +1,11 @@
 """Networks that rows of a table need: found where they are finished, trained where that is asked for.
 
+    OUT/trained/asked.json                          spec, plate and pictures of all trainings there
     OUT/trained/OCCLUSION/OBSTRUCTION/NAME_SEED/    a training as `doedesign train` writes it, or that of a rival
 
 A finished training of the design's own run (`RUN/trained`, or a released model) with the same seed, occlusion model and
 obstruction stands for "proposed". All are trained on the same pictures, with the steps, sizes and seeds of the
-design's spec. On a processor several are trained side by side, each by a process with one thread: a training keeps
+design's spec; others are refused, for they are found by their names. On a processor several are trained side by side, each by a process with one thread: a training keeps
 little more than one core busy, however many there are.
 """
 
@@ -20,6 +21,7 @@ from typing import Any, ClassVar
 
 import jax
 
+from doedesign.capture.images import Pictures, picture_files
 from doedesign.design.design import Design
 from doedesign.evaluation.rivals.training import train_rival
 from doedesign.evaluation.rows import ROBUST, Training
@@ -28,10 +30,13 @@ from doedesign.runs.folder import RELEASED, TRAINING_TABLES, open_run
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.pool import default_workers, evaluate_here
 from doedesign.runtime.progress import meter
+from doedesign.spec import spec_digest
 from doedesign.training.history import HISTORY_NAME
 from doedesign.training.train import train
-from fab.files import MANIFEST_NAME, read_json
+from fab.errors import InputError
+from fab.files import MANIFEST_NAME, canonical_json, read_json, write_atomic
 
+ASKED_NAME = "asked.json"
 _TRAINING_BYTES = 4 << 30  # an estimate: a training at its peak, crops of 256 pixels
 _log = logging.getLogger("doedesign")
 
@@ -103,6 +108,33 @@ class TrainingPlan:
     def changes(self, training: Training, seed: int) -> tuple[str, ...]:
         """Changes to the spec of the design that a training makes."""
         return (*self.overrides, f"train.seed={seed}", *training.changes)
+
+
+def claim_trainings(plan: TrainingPlan, design: Design, *, add: bool) -> None:
+    """Refuse trainings that were made of something else, and keep what those that are added are made of.
+
+    Args:
+        plan: what they have in common.
+        design: the design of the run, with the plan's changes.
+        add: whether some will be trained; otherwise their pictures do not matter.
+
+    Raises:
+        InputError: trainings of another spec, plate or other pictures.
+    """
+    assert design.spec is not None  # every run has one
+    asked = {"spec_sha256": spec_digest(design.spec), "level_map_sha256": design.level_map.digest}
+    if add:
+        asked["pictures_sha256"] = Pictures(tuple(picture_files(plan.images))).digest()
+    path = plan.out / "trained" / ASKED_NAME
+    if not path.is_file() or all(other == path for other in path.parent.iterdir()):
+        if add:
+            write_atomic(path, canonical_json(asked))
+        return
+    found = read_json(path)
+    if different := [key.removesuffix("_sha256") for key, value in asked.items() if found.get(key) != value]:
+        rule = "networks of a table must be trained with one spec, plate and set of pictures"
+        got = f"those with other {', '.join(different).replace('_', ' ')}"
+        raise InputError(str(path.parent), rule, got, "Choose another folder, or remove them.")
 
 
 def _is_finished(folder: Path) -> bool:

@@ -27,7 +27,7 @@ from doedesign.evaluation.published import TABLE_1, TABLE_2, published_scores
 from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow, rows_of, trainings_of
 from doedesign.evaluation.statistics import BootstrapInterval, bootstrap_mean
 from doedesign.evaluation.tables import LATER, REGIONS, SCORES, EvaluationTable, TableRow
-from doedesign.evaluation.trainings import TrainingPlan, train_missing
+from doedesign.evaluation.trainings import TrainingPlan, claim_trainings, train_missing
 from doedesign.recon.weights import NETWORK_NAME
 from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.level_maps import open_design
@@ -598,6 +598,27 @@ def test_another_question_needs_another_folder(run: Path, tmp_path: Path):
     evaluate(run, tmp_path / "out", pairs=1, workers=0)
     with pytest.raises(InputError, match=r"one with another .*seed"):
         evaluate(run, tmp_path / "out", pairs=1, seed=1, workers=0)
+
+
+def test_networks_of_a_table_have_one_spec_plate_and_set_of_pictures(run: Path, tmp_path: Path):
+    """They are found by their names; those of something else are refused, and what no network was made with is not."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "cat.png").write_bytes(sample_files()[0].read_bytes())
+    plan = TrainingPlan(run, tmp_path, "paper", "dirt", images=tmp_path / "images")
+    design = open_design(run, False)
+    other = open_design(run, False, overrides=["train.steps=7"], free=TRAINING_TABLES)
+    claim_trainings(plan, other, add=False)
+    assert not (tmp_path / "trained").exists()
+    claim_trainings(plan, other, add=True)
+    claim_trainings(plan, design, add=True)  # nothing was trained yet
+    (tmp_path / "trained" / "paper").mkdir()
+    claim_trainings(plan, design, add=True)
+    with pytest.raises(InputError, match="those with other spec"):
+        evaluate(run, tmp_path, pairs=1, overrides=["train.steps=7"], workers=0)
+    (tmp_path / "images" / "dog.png").write_bytes(sample_files()[1].read_bytes())
+    claim_trainings(plan, design, add=False)  # none is added
+    with pytest.raises(InputError, match="those with other pictures"):
+        claim_trainings(plan, design, add=True)
 
 
 @pytest.mark.study

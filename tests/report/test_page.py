@@ -403,6 +403,13 @@ def test_commands_to_repeat_a_run_have_their_options(run: Path):
         targets |= {"throughput": 0.86, "throughput_sigma": 0.02}
         (folder / "explanations.json").write_bytes(canonical_json({"targets": targets, "reach": 4.0}))
     captured(run)
+    (run / "evaluation" / "table2-dirt-paper").mkdir(parents=True)
+    table = {"table": 2, "pairs": 3, "rows": [], "study": {"obstruction": "dirt", "occlusion": "paper", "seed": 4}}
+    (run / "evaluation" / "table2-dirt-paper" / "table.json").write_bytes(canonical_json(table))
+    (run / "trained").mkdir()
+    (run / "trained" / MANIFEST_NAME).write_bytes(canonical_json({"occlusion": "paper", "obstruction": "dirt"}))
+    (run / "trained" / "pictures.json").write_bytes(canonical_json({"training": ["mine.png"]}))
+    (run / "trained" / "spec.toml").write_text('# --set train.steps=3\nname = "small"\n')
     assert repeated(run) == [
         "doedesign optimize spec.toml --out runs/small",
         "doedesign psf runs/small",
@@ -410,6 +417,8 @@ def test_commands_to_repeat_a_run_have_their_options(run: Path):
         "doedesign tolerance runs/small --draws 8 --seed 0 --sensitivity sobol --sobol 32 --corners --budget overlay_x "
         "--yield 0.8 --limit 'strehl >= 0.9'",
         "doedesign simulate runs/small",
+        "doedesign train runs/small --occlusion paper --obstruction dirt --images PICTURES --set train.steps=3",
+        "doedesign evaluate runs/small --table 2 --obstruction dirt --occlusion paper --seed 4 --pairs 3",
         "doedesign calibrate runs/small --ring-to-disc 1.2 --probe '520 nm' --depth '100 mm' --throughput 0.86 "
         "--throughput-sigma 0.02 --reach 4",
         "doedesign report runs/small",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from doedesign import __version__
+from doedesign.capture.images import sample_files
 from doedesign.report.page.blocks import CommandBlock, PageBlock, PageSection, TableBlock, TextBlock, section
 from doedesign.report.page.files import RunFiles, listed_bytes, listed_json
 from fab.files import MANIFEST_NAME, read_bytes, read_json
@@ -79,8 +80,15 @@ def _commands(files: RunFiles) -> CommandBlock:
         run=shlex.quote(f"runs/{files.name}"),
         order=None if files.order is None else shlex.quote(f"masks/{files.name}"),
         changes=tuple(shlex.quote(str(one)) for one in (overrides if isinstance(overrides, list) else ())),
-        results=tuple((name, _OPTIONS[name](files) if name in _OPTIONS else ()) for name in there),
+        results=tuple((name, options) for name in there for options in _calls(name, files)),
     )
+
+
+def _calls(name: str, files: RunFiles) -> tuple[Options, ...]:
+    """Options of every call of a command that a folder of results has to do with."""
+    if name == "evaluation":
+        return _of_evaluation(files)
+    return (_OPTIONS[name](files) if name in _OPTIONS else (),)
 
 
 def _of_psf(files: RunFiles) -> Options:
@@ -126,6 +134,35 @@ def _of_simulated(files: RunFiles) -> Options:
     return tuple([*found, *((("png", ""),) if "PNG" in str(record.get("image_files")) else ())])
 
 
+def _of_trained(files: RunFiles) -> Options:
+    """Where it is not that of the spec; the folder of the pictures is not known."""
+    folder = files.folder / "trained"
+    record, own = _manifest_of(folder), files.spec
+    usual = {"occlusion": own.scene.occlusion, "obstruction": own.obstruction.kind if own.obstruction else None}
+    found = [(key, shlex.quote(str(record[key]))) for key, value in usual.items() if record.get(key, value) != value]
+    pictures = read_json(folder / "pictures.json") if (folder / "pictures.json").is_file() else {}
+    if not {*pictures.get("training", ())} <= {path.name for path in sample_files()}:
+        found.append(("images", "PICTURES"))
+    spec = folder / "spec.toml"
+    text = read_bytes(spec).decode(errors="replace") if spec.is_file() else ""
+    return *found, *(("set", shlex.quote(one)) for one in re.findall(r"^# --set (.+)$", text, re.MULTILINE))
+
+
+def _of_evaluation(files: RunFiles) -> tuple[Options, ...]:
+    """Every table and figure; rows that are left out, folders of pictures and trainings are not known."""
+    home, found = files.folder / "evaluation", []
+    for path in sorted(home.glob("table*/table.json")):
+        table = read_json(path)
+        study = _mapping(table.get("study"))
+        asked = [(key, shlex.quote(str(study[key]))) for key in ("obstruction", "occlusion", "seed") if key in study]
+        asked += [("reflect", "")] if study.get("border") == "reflect" else []
+        found.append((("table", str(table.get("table"))), *asked, ("pairs", str(table.get("pairs")))))
+    for name, figure in {"figure4": "4", "figure8": "8", "bench": "bench"}.items():
+        if (home / name).is_dir():
+            found.append((("figure", figure),))
+    return tuple(found)
+
+
 def _of_explanations(files: RunFiles) -> Options:
     record = listed_json(files.folder / "explanations", "explanations.json")
     if record is None:
@@ -154,6 +191,7 @@ _OPTIONS: Mapping[str, Callable[[RunFiles], Options]] = {
     "fabricated": _of_fabricated,
     "tolerance": _of_tolerance,
     "simulated": _of_simulated,
+    "trained": _of_trained,
     "explanations": _of_explanations,
 }
 
