@@ -5,8 +5,8 @@
 
 A finished training of the design's own run (`RUN/trained`, or a released model) with the same seed, occlusion model and
 obstruction stands for "proposed". All are trained on the same pictures, with the steps, sizes and seeds of the
-design's spec; others are refused, for they are found by their names. On a processor several are trained side by side, each by a process with one thread: a training keeps
-little more than one core busy, however many there are.
+design's spec; others are refused, for they are found by their names. On a processor several are trained side by side,
+each by a process with one thread: a training keeps little more than one core busy, however many there are.
 """
 
 import logging
