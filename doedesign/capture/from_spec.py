@@ -122,7 +122,10 @@ def _made(kind: Any, parameters: Mapping[str, Any], where: str) -> Any:
     try:
         return kind(**parameters)
     except InputError as error:
-        raise InputError(f"{where}: {error.where}", error.rule, error.got, error.cure) from error
+        name, _, parameter = error.where.partition(": ")
+        key = parameter.removesuffix("_m").removesuffix("_rad")
+        place = f"{where}.{key}" if name == kind.name and key else f"{where}: {error.where}"
+        raise InputError(place, error.rule, error.got, error.cure) from error
     except TypeError as error:  # a parameter without which there is nothing
         raise InputError(where, "must hold all that the kind needs", f'"{error}"', "Add it.") from error
 

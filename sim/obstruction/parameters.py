@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.errors import InputError
+from fab.units import format_angle, format_length
 from sim.imaging.scene import Obstruction
 from sim.obstruction.view import CameraView
 
@@ -54,14 +55,26 @@ class WithLimits:
             given, usual = getattr(self, parameter), getattr(type(self), parameter, None)
             left_out = all(value is None for value in (given, usual))
             whole, where = isinstance(usual, int), f"{self.name}: {parameter}"
+            least, most, got = (_told(parameter, value) for value in (low, high, given))
             if isinstance(usual, tuple):
                 two = isinstance(given, tuple | list) and len(given) == 2 and all(map(is_number, given))
                 if not two or not low <= given[0] <= given[1] <= high:
-                    rule = f"must be two numbers, the smaller first, from {low:g} to {high:g}"
-                    raise InputError(where, rule, repr(given), "Give the same number twice for a fixed value.")
+                    rule = f"must be two numbers, the smaller first, from {least} to {most}"
+                    raise InputError(where, rule, got, "Give the same number twice for a fixed value.")
             elif not left_out and not (is_number(given, Integral if whole else Real) and low <= given <= high):
-                rule = f"must be a {'whole ' if whole else ''}number from {low:g} to {high:g}"
-                raise InputError(where, rule, repr(given), "Give a number within.")
+                rule = f"must be a {'whole ' if whole else ''}number from {least} to {most}"
+                raise InputError(where, rule, got, "Give a number within.")
+
+
+def _told(parameter: str, value: Any) -> str:
+    """A value as messages say it: a length or an angle, as the ending of the parameter's name says, with its unit."""
+    if isinstance(value, tuple | list) and value and all(map(is_number, value)):
+        return " and ".join(_told(parameter, each) for each in value)
+    if not is_number(value):
+        return repr(value)
+    if parameter.endswith("_m"):
+        return format_length(float(value))
+    return format_angle(float(value)) if parameter.endswith("_rad") else f"{value:g}"
 
 
 def is_number(value: Any, kind: type = Real) -> bool:

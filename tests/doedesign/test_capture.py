@@ -17,6 +17,7 @@ from doedesign.capture.from_spec import (
     sensor_from_spec,
 )
 from doedesign.capture.image_files import read_image, write_image
+from doedesign.optimization import optimize
 from doedesign.spec import load_spec, scene, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
 from fab.files import canonical_json
@@ -160,17 +161,20 @@ def test_options_are_physical_parameters_with_units():
         ("{clumps='1 mm'}", ["`clumps`", "Did you mean `clump`?"]),
         ("{clump='1 s'}", ["obstruction.options.clump", "a number with a unit"]),
         ("{clump=3}", ["obstruction.options.clump", "a number with a unit"]),
-        ("{coverage=[0.5, 0.1]}", ["dirt: coverage", "the smaller first"]),
-        ("{coverage='much'}", ["dirt: coverage", "two numbers", "'much'"]),
-        ("{coverage=[0.1, 'much']}", ["dirt: coverage", "two numbers"]),
-        ("{coverage=[0.1, 0.2, 0.3]}", ["dirt: coverage", "two numbers"]),
-        ("{coverage=[[0.1, 0.2], [0.2, 0.3]]}", ["dirt: coverage", "two numbers"]),
-        ("{coverage=true}", ["dirt: coverage", "two numbers"]),
-        ("{clump='-1 mm'}", ["dirt: clump_m", "two numbers", "(-0.001, -0.001)"]),
-        ("{octaves=2.5}", ["dirt: octaves", "a whole number from 1 to 10"]),
-        ("{octaves=true}", ["dirt: octaves", "a whole number"]),
-        ("{grain=[0.1, 0.2]}", ["dirt: grain", "a number from 0 to 1"]),
-        ("{grain='coarse'}", ["dirt: grain", "a number from 0 to 1", "'coarse'"]),
+        ("{coverage=[0.5, 0.1]}", ["obstruction.options.coverage", "the smaller first"]),
+        ("{coverage='much'}", ["obstruction.options.coverage", "two numbers", "'much'"]),
+        ("{coverage=[0.1, 'much']}", ["obstruction.options.coverage", "two numbers"]),
+        ("{coverage=[0.1, 0.2, 0.3]}", ["obstruction.options.coverage", "two numbers"]),
+        ("{coverage=[[0.1, 0.2], [0.2, 0.3]]}", ["obstruction.options.coverage", "two numbers"]),
+        ("{coverage=true}", ["obstruction.options.coverage", "two numbers"]),
+        (
+            "{clump='-1 mm'}",
+            ["obstruction.options.clump", "two numbers", "to 100 mm, but got -1 mm and -1 mm"],
+        ),
+        ("{octaves=2.5}", ["obstruction.options.octaves", "a whole number from 1 to 10"]),
+        ("{octaves=true}", ["obstruction.options.octaves", "a whole number"]),
+        ("{grain=[0.1, 0.2]}", ["obstruction.options.grain", "a number from 0 to 1"]),
+        ("{grain='coarse'}", ["obstruction.options.grain", "a number from 0 to 1", "'coarse'"]),
     ],
 )
 @pytest.mark.usefixtures("annotations_unchecked")
@@ -179,6 +183,11 @@ def test_options_that_make_no_sense(options: str, words: list[str]):
         obstruction_from_spec(spec_of(f"obstruction.options={options}"), "a.toml")
     for word in ["a.toml", *words]:
         assert word in str(caught.value)
+
+
+def test_options_that_make_no_sense_are_told_before_a_design_is_optimised():
+    with pytest.raises(InputError, match=r"obstruction\.options\.clump: must be two numbers"):
+        optimize(spec_of('obstruction.options={clump="3 km"}'))
 
 
 def test_a_folder_of_masks(tmp_path: Path):
