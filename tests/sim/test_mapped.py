@@ -62,6 +62,30 @@ def test_plane_waves_are_integrated_over_parallelograms(name: str, fill: float, 
     assert np.linalg.norm(found - wanted) < limit * np.linalg.norm(wanted)
 
 
+@pytest.mark.parametrize("degrees", [0.5, 2.0])
+def test_the_predicted_error_is_that_of_turned_pixels(degrees: float, rng: np.random.Generator):
+    """Speckle behind a disc, over parallelograms: a spectrum of plane waves, each integrated in closed form."""
+    matrix, window, cutoff = turn(degrees), 24, 0.45
+    places = affine(matrix)
+    waves = rng.uniform(-cutoff, cutoff, (400, 2))
+    waves = waves[np.hypot(*waves.T) < cutoff]
+    ratio = np.hypot(*waves.T) / cutoff
+    strengths = np.sqrt(2 / np.pi * (np.arccos(ratio) - ratio * np.sqrt(1 - ratio**2)))
+    phases, image = rng.uniform(size=len(waves)), np.zeros((SAMPLES, SAMPLES))
+    centres = np.arange(window) - (window - 1) / 2
+    y, x = places(centres[:, None], centres)
+    wanted = np.zeros((window, window))
+    for (fy, fx), phase, strength in zip(waves, phases, strengths, strict=True):
+        image += strength * np.cos(2 * np.pi * (fy * AXIS[:, None] + fx * AXIS + phase))
+        along_row, along_column = PITCH * (np.array([fy, fx]) @ matrix)
+        value = strength * np.cos(2 * np.pi * (fy * y + fx * x + phase))
+        wanted += PITCH**2 * value * np.sinc(along_row) * np.sinc(along_column)
+    pixels, predicted = plan_mapped_pixels(places, window, 1.0, cutoff, np.ones(SAMPLES))
+    found = np.asarray(pixels.energy(jnp.asarray(image, jnp.float32)), np.float64)
+    # 576 pixels of a width of several samples: some hundred independent ones, of a spectrum of as many waves.
+    assert np.linalg.norm(found - wanted) / np.linalg.norm(wanted) == pytest.approx(predicted, rel=0.25)
+
+
 def test_all_light_is_counted_once():
     """A blob of light within the window, whatever the map does to the pixels around it."""
     blob = np.exp(-((AXIS[:, None] - 31.0) ** 2 + (AXIS + 22.0) ** 2) / 60)
