@@ -31,7 +31,7 @@ from sim.camera import Camera, Colour
 from sim.illumination import Beam, EvenBeam, GaussianBeam, MeasuredBeam, power_through
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
-_SHARED = ("tone", "minimum_line_m", "minimum_space_m", "die_m", "wafer_radius_m")
+_SHARED = ("tone", "minimum_line_m", "minimum_space_m", "die_m", "wafer_radius_m", "reduction")
 # Share of a beam's power that the aperture must let through; fields of single precision hold no less of it than this.
 _LEAST_POWER = 1e-9
 _EVENTS = ("particles_per_m2", "pinholes_per_m2", "missed", "doubled")

@@ -67,6 +67,7 @@ _MASKS, _LIGHT = "precompensation.csv", "precompensation_light.csv"
 # mean errors.
 _DEPTH_STEP, _EDGE_STEP, _REACH = 0.01, 0.02, 8.0
 _SETTLED = 0.02  # of a step
+_SAME_M = 0.5e-6  # by which radii of wafers may differ
 _ROOM = 0.9  # of half the narrowest line and space that edges may take, so that nothing closes
 _TOLD = ("ring_to_disc", "far_spot", "on_target")  # numbers of the light that are logged
 
@@ -239,6 +240,7 @@ def precompensate(
     if made_by.expected().nominal:
         rule, cure = "must have errors whose means are not 0", "Give the estimate of a calibration."
         raise InputError("process", rule, made_by.name, cure)
+    made_by = _on_wafer(made_by, drawn.spec)
     # Errors of depth are shares, whatever depths an earlier pre-compensation commanded.
     aim = drawn.aim or drawn.level_map
     design = replace(drawn, level_map=aim, edge_moves_m=(), aim=None)
@@ -348,6 +350,18 @@ def _miss(design: Design, spec: Spec, plate: FabricatedDoe) -> float:
     # Where phases are given, light counts in the wave that they make.
     light = found.total if found.wave is None else found.wave.share
     return 1.0 - light + spec.spots.uniformity * found.uniformity_error
+
+
+def _on_wafer(process: Process, spec: Spec) -> Process:
+    """The process on the wafer of a spec; where the DOE lies in the middle of any, that changes nothing."""
+    radius_m = spec.wafer.diameter_m / 2
+    if abs(process.wafer_radius_m - radius_m) < _SAME_M:
+        return process
+    if any(process.die_m):
+        rule = f"must be for the wafer of the run, of radius {format_length(radius_m)}"
+        cure = "Say where on this wafer the DOE lies, or optimise for the wafer of the process."
+        raise InputError("process: wafer_radius_m", rule, format_length(process.wafer_radius_m), cure)
+    return replace(process, wafer_radius_m=radius_m)
 
 
 def _compensated(task: _Task, commands: _Commands, name: str) -> Design:

@@ -97,6 +97,8 @@ class Process:
         minimum_space_m: narrowest gap it prints.
         die_m: where on the wafer the DOE lies (y, x).
         wafer_radius_m: radius of the wafer.
+        reduction: how many times as large as on the wafer its reticles are, which hold one die; 1 for photomasks that
+            print a whole wafer by contact.
         name: what it is called.
     """
 
@@ -109,6 +111,7 @@ class Process:
     minimum_space_m: float = 0.0
     die_m: tuple[float, float] = (0.0, 0.0)
     wafer_radius_m: float = 50 * MM
+    reduction: int = 1
     name: str = "ideal"
 
     def __post_init__(self) -> None:
@@ -128,6 +131,8 @@ class Process:
                 raise InputError(
                     f"process: {name}", "must be finite and not negative", getattr(self, name), "Give 0 or more."
                 )
+        if self.reduction < 1:
+            raise InputError("process: reduction", "must be 1 or more", self.reduction, "For example 5.")
         if not math.hypot(*self.die_m) <= self.wafer_radius_m:
             rule = f"must lie on the wafer of radius {self.wafer_radius_m} m"
             raise InputError("process: die_m", rule, self.die_m, "Move the die.")

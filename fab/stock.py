@@ -13,7 +13,7 @@ the masks are printed.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from fab.deviations import Source, Typical, estimate, sourced
 from fab.errors import InputError
@@ -82,7 +82,8 @@ class Stock:
         }
         limits = {name: getattr(self, name).value for name in ("minimum_line_m", "minimum_space_m", "wafer_radius_m")}
         defects = Defects(**{name: figure.value for name, figure in self.defects.items()})
-        return Process(levels, spreads=spreads, defects=defects, tone=self.tone, name=self.name, **limits)
+        known: dict[str, Any] = {"tone": self.tone, "reduction": self.reduction, "name": self.name, **limits}
+        return Process(levels, spreads=spreads, defects=defects, **known)
 
 
 def process_from(given: Process | str | None, levels: Levels) -> Process:
@@ -101,11 +102,6 @@ def process_from(given: Process | str | None, levels: Levels) -> Process:
     if given not in known:
         raise InputError("process", "must be a process or the name of one", repr(given), f"Name {' or '.join(known)}.")
     return known[given].process(levels)
-
-
-def reduction_of(process: Process) -> int:
-    """How many times as large as on the wafer the reticles of a process are, by its name; 1 for plates at contact."""
-    return STOCK[process.name].reduction if process.name in STOCK else 1
 
 
 # --- rare events ------------------------------------------------------------------------------------------------------

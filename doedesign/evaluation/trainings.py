@@ -1,6 +1,6 @@
 """Networks that rows of a table need: found where they are finished, trained where that is asked for.
 
-    OUT/trained/asked.json                          spec, plate and pictures of all trainings there
+    OUT/trained/asked.json                          spec, plates, pictures and obstructions of all trainings there
     OUT/trained/OCCLUSION/OBSTRUCTION/NAME_SEED/    a training as `doedesign train` writes it, or that of a rival
 
 A finished training of the design's own run (`RUN/trained`, or a released model) with the same seed, occlusion model and
@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 
 import jax
 
+from doedesign.capture.from_spec import obstruction_from_spec, plain_parameters
 from doedesign.capture.images import Pictures, picture_files
 from doedesign.design.design import Design
 from doedesign.evaluation.rivals.training import train_rival
@@ -34,7 +35,7 @@ from doedesign.spec import spec_digest
 from doedesign.training.history import HISTORY_NAME
 from doedesign.training.train import train
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, canonical_json, read_json, write_atomic
+from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes, write_atomic
 
 ASKED_NAME = "asked.json"
 _TRAINING_BYTES = 4 << 30  # an estimate: a training at its peak, crops of 256 pixels
@@ -123,6 +124,10 @@ def claim_trainings(plan: TrainingPlan, design: Design, *, add: bool) -> None:
     """
     assert design.spec is not None  # every run has one
     asked = {"spec_sha256": spec_digest(design.spec), "level_map_sha256": design.level_map.digest}
+    parameters = plain_parameters(obstruction_from_spec(design.spec, str(plan.run / "spec.toml"), plan.obstruction))
+    asked[f"{Path(plan.obstruction).name}_sha256"] = sha256_bytes(canonical_json(parameters))
+    if plan.robust is not None:
+        asked["robust_level_map_sha256"] = open_design(plan.robust, False).level_map.digest
     if add:
         asked["pictures_sha256"] = Pictures(tuple(picture_files(plan.images))).digest()
     path = plan.out / "trained" / ASKED_NAME
@@ -131,10 +136,12 @@ def claim_trainings(plan: TrainingPlan, design: Design, *, add: bool) -> None:
             write_atomic(path, canonical_json(asked))
         return
     found = read_json(path)
-    if different := [key.removesuffix("_sha256") for key, value in asked.items() if found.get(key) != value]:
-        rule = "networks of a table must be trained with one spec, plate and set of pictures"
+    if different := [key.removesuffix("_sha256") for key, value in asked.items() if found.get(key, value) != value]:
+        rule = "networks of a table must be trained with one spec, plate, set of pictures and kind of obstruction"
         got = f"those with other {', '.join(different).replace('_', ' ')}"
         raise InputError(str(path.parent), rule, got, "Choose another folder, or remove them.")
+    if add:
+        write_atomic(path, canonical_json({**found, **asked}))
 
 
 def _is_finished(folder: Path) -> bool:

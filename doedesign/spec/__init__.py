@@ -33,7 +33,7 @@ from typing import Any
 from doedesign.spec.checks import find_problems
 from doedesign.spec.doubts import spec_warnings
 from doedesign.spec.errors import SpecError, Table, key_as_written, spec_error, validated
-from doedesign.spec.left_out import with_left_out
+from doedesign.spec.left_out import one_wafer, with_left_out
 from doedesign.spec.models import Spec
 from doedesign.spec.order import OrderFile, OrderSpec
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSpec
@@ -165,6 +165,7 @@ def _load(
 ) -> Table:
     """Read a file; with a `table`, pass over the other tables of a spec. `usual` stands for keys that are left out."""
     raw = read_toml(Path(path), *_FILES[model])
+    raw |= {name: filled for name, filled in one_wafer(raw).items() if name in raw}
     others = {toml_key(name) for name in Spec.model_fields if table} - {table}
     raw = {key: value for key, value in raw.items() if key not in others}
     for name, keys in (usual or {}).items():

@@ -49,7 +49,7 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
     Raises:
         InputError: a mistake in what the spec says, which has to be right before the rest can follow from it.
     """
-    filled: dict[str, Any] = dict(raw) | _one_wafer(raw)
+    filled: dict[str, Any] = dict(raw) | one_wafer(raw)
     # A mistake in what says the task is told by itself, without all that would follow from it.
     aimed = any(name in raw for name in _AIMS)
     optimize, optics, sensor = (raw.get(name, {}) for name in ("optimize", "optics", "sensor"))
@@ -78,8 +78,12 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
     return filled
 
 
-def _one_wafer(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """The table that leaves out the size of the wafer, with that which the other one gives."""
+def one_wafer(raw: Mapping[str, Any]) -> dict[str, Any]:
+    """The table that leaves out the size of the wafer, with that which the other one gives.
+
+    Args:
+        raw: the tables of a file as they were read.
+    """
     process, wafer = raw.get("process", {}), raw.get("wafer", {})
     if not (isinstance(process, Mapping) and isinstance(wafer, Mapping)):
         return {}

@@ -206,6 +206,8 @@ class ProcessSpec(SpecTable, frozen=True):
         minimum_space_m: narrowest gap the lithography prints.
         die_m: where on the wafer the DOE lies (y, x).
         wafer_radius_m: radius of the wafer, half of `wafer.diameter`; one of them is enough.
+        reduction: how many times as large as on the wafer the reticles of a stepper are; 1 for photomasks that print a
+            whole wafer by contact, which is what `doedesign masks` draws.
         errors: how far the process strays.
         defects: rare events.
     """
@@ -228,6 +230,7 @@ class ProcessSpec(SpecTable, frozen=True):
     minimum_space_m: Feature | None = optional(example='"1 um"')
     die_m: tuple[Place, Place] | None = optional(example='["0 mm", "20 mm"]')
     wafer_radius_m: Annotated[float, length(*RADII_M)] | None = optional(example='"50 mm"')
+    reduction: Annotated[int, Field(strict=True, ge=1, le=20)] | None = optional(example="5")
     errors: ErrorsSpec = optional(ErrorsSpec())
     defects: DefectsSpec = optional(DefectsSpec())
 
@@ -258,6 +261,7 @@ class ProcessSpec(SpecTable, frozen=True):
             "minimum_space_m": stock.minimum_space_m.value,
             "die_m": (0.0, 0.0),
             "wafer_radius_m": stock.wafer_radius_m.value,
+            "reduction": stock.reduction,
             "etches": tuple(EtchSpec(mask=mask) for mask in sorted(range(self.masks), key=self.depth_m)),
         }
         errors = {name: {"mean": typical.mean, "sigma": typical.sigma} for name, typical in stock.errors.items()}

@@ -16,7 +16,6 @@ from fab.layout.structures import BAR_WIDTHS_UM
 from fab.order.drawing import DrawnOrder
 from fab.order.order import Order
 from fab.runsheet.page import html_page
-from fab.stock import reduction_of
 from fab.units import MM, NM, UM
 
 Values = dict[str, Any]
@@ -82,7 +81,7 @@ def _shared(order: Order) -> Values:
 
 
 def _scale(order: Order) -> str:
-    reduction = reduction_of(order.process)
+    reduction = order.process.reduction
     return "1:1" if reduction == 1 else f"1:1; the reticle is the cell of a die, {reduction} times as large"
 
 

@@ -25,7 +25,7 @@ from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair import Repair, repaired
 from fab.runsheet.tables import SILICA, Predictions
 from fab.solids.patch import Patch
-from fab.stock import STOCK, process_from, reduction_of
+from fab.stock import STOCK, process_from
 from fab.units import NM, UM, format_length
 
 if TYPE_CHECKING:
@@ -248,9 +248,9 @@ def plan_order(
             are asked for, or masks that it cannot print where that is to fail.
     """
     made_by = process_from(process, level_map.levels)
-    if (reduction := reduction_of(made_by)) > 1 and not one_to_one:
+    if made_by.reduction > 1 and not one_to_one:
         rule = "must print plates at 1:1 by contact, a whole wafer at a time, which is what is drawn"
-        got = f'"{made_by.name}", whose reticles hold one die, {reduction} times as large'
+        got = f'"{made_by.name}", whose reticles hold one die, {made_by.reduction} times as large'
         cure = (
             'Choose another process, such as "contact_aligner", or take plates at 1:1 by `one_to_one` and have the '
             "mask shop enlarge the cell of a die."

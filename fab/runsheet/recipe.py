@@ -32,6 +32,7 @@ _RESISTS: Mapping[str, str] = {
     "positive": "POSITIVE resist (light opens it)",
     "negative": "NEGATIVE or image-reversal resist (it stays where light falls)",
 }
+_STRIP = "Remover, then oxygen plasma."
 _LIFTOFF_FOLD: Mapping[str, int] = {"evaporated": 5, "sputtered": 10}
 
 
@@ -97,12 +98,17 @@ def tone_words(photomask: Photomask) -> str:
     return "polygons are DARK: glass all over, the polygons are chrome (clear-field plate)"
 
 
+def _on(material: str, how: str) -> str:
+    """How something is done that would harm, or fail on, another material than fused silica."""
+    return how if material == SILICA else f"By the lab's recipe for {material}."
+
+
 def _printing(
-    photomask: Photomask, file: str, align: str, thickness_m: float, why: str, rim_m: float
+    photomask: Photomask, file: str, align: str, thickness_m: float, why: str, rim_m: float, material: str
 ) -> tuple[Action, ...]:
     """List the actions from the resist to the developed pattern, the same for every photomask."""
     return (
-        Action("Prime", "HMDS vapour, so that the resist sticks to the surface."),
+        Action("Prime", _on(material, "HMDS vapour, so that the resist sticks to the surface.")),
         Action(
             "Resist",
             f"Spin {_RESISTS[photomask.resist]}, {format_length(float(f'{thickness_m:.3g}'))} or thicker. {why}",
@@ -146,7 +152,11 @@ def _etch_actions(photomask: Photomask, process: Process, material: str) -> tupl
     if material != SILICA:
         ions = f"Into the {material}, by the lab's recipe for it"
     return (
-        Action("Descum", "Oxygen plasma, short, so that no film of resist is left in the openings.", ("time (s)",)),
+        Action(
+            "Descum",
+            _on(material, "Oxygen plasma, short, so that no film of resist is left in the openings."),
+            ("time (s)",),
+        ),
         Action(
             "Hard bake",
             "By the resist's data sheet, and not so hot that its edges flow: it has to stand the plasma.",
@@ -164,24 +174,26 @@ def _etch_actions(photomask: Photomask, process: Process, material: str) -> tupl
             "= missing depth / rate. An etch that is too deep stays so.",
             ("extra time (s)",),
         ),
-        Action("Strip", "Remover, then oxygen plasma. No resist may stay at the edges of the openings."),
+        Action("Strip", _on(material, _STRIP) + " No resist may stay at the edges of the openings."),
     )
 
 
-def _chrome_actions(photomask: Photomask, chrome_m: float, deposition: Deposition) -> tuple[Action, ...]:
+def _chrome_actions(photomask: Photomask, chrome_m: float, deposition: Deposition, material: str) -> tuple[Action, ...]:
     thickness = format_length(chrome_m)
     if lifts_off(photomask):
         return (
-            Action("Descum", "Oxygen plasma, short. Metal holds on clean glass only.", ("time (s)",)),
+            Action("Descum", _on(material, "Oxygen plasma, short. Metal holds on clean glass only."), ("time (s)",)),
             Action("Deposit", f"Chrome, {thickness}, {deposition}. Keep the wafer cool.", ("thickness (nm)",)),
-            Action("Lift off", "Remover, warm, then ultrasound. Rinse while wet: flakes that dry stay.", ()),
+            Action(
+                "Lift off", _on(material, "Remover, warm, then ultrasound. Rinse while wet: flakes that dry stay."), ()
+            ),
         )
     return (
         Action(
             "Hard bake", "By the resist's data sheet, so that it holds in the etch.", ("temperature (C)", "time (s)")
         ),
         Action("Etch the chrome", "Wet (ceric ammonium nitrate), until the glass is clear.", ("time (s)",)),
-        Action("Strip", "Remover, then oxygen plasma."),
+        Action("Strip", _on(material, _STRIP)),
     )
 
 
@@ -244,12 +256,18 @@ def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
             how = f"Chrome all over, {format_length(chrome_m)}, {deposition}."
             before.append(Action("Deposit", how, ("thickness (nm)",)))
         before += _printing(
-            photomask, sheet.files[photomask.name].file, align, thickness_m, why, sheet.wafer.edge_exclusion_m
+            photomask,
+            sheet.files[photomask.name].file,
+            align,
+            thickness_m,
+            why,
+            sheet.wafer.edge_exclusion_m,
+            sheet.material,
         )
         after = (
             _etch_actions(photomask, process, sheet.material)
             if photomask.makes == "etch"
-            else _chrome_actions(photomask, chrome_m, deposition)
+            else _chrome_actions(photomask, chrome_m, deposition, sheet.material)
         )
         steps.append(Step(photomask, tuple(before), after, _deepest_m(etched, sheet.level_map.levels)))
     return tuple(steps)

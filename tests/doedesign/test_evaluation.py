@@ -615,6 +615,13 @@ def test_networks_of_a_table_have_one_spec_plate_and_set_of_pictures(run: Path, 
     claim_trainings(plan, design, add=True)
     with pytest.raises(InputError, match="those with other spec"):
         evaluate(run, tmp_path, pairs=1, overrides=["train.steps=7"], workers=0)
+    thicker = open_design(run, False, overrides=["obstruction.options={coverage=0.2}"], free=TRAINING_TABLES)
+    with pytest.raises(InputError, match="those with other spec, dirt"):
+        claim_trainings(plan, thicker, add=False)
+    claim_trainings(replace(plan, robust=run), design, add=True)
+    again = finished_run(tmp_path, SPEC.replace('"ring"', '"flat"'))
+    with pytest.raises(InputError, match="those with other robust level map"):
+        claim_trainings(replace(plan, robust=again), design, add=True)
     (tmp_path / "images" / "dog.png").write_bytes(sample_files()[1].read_bytes())
     claim_trainings(plan, design, add=False)  # none is added
     with pytest.raises(InputError, match="those with other pictures"):

@@ -18,6 +18,7 @@ from doedesign.spec import (
     load_process,
     load_spec,
     load_variation,
+    load_wafer,
     process_from_json,
     process_to_toml,
     spec_digest,
@@ -99,6 +100,27 @@ def test_the_size_of_the_wafer_is_stated_once():
     message = refusal(load_spec, AUTOMOTIVE, both)
     assert "process.wafer_radius: must be half of wafer.diameter, 150 mm, but got 50 mm" in message
     assert load_spec(AUTOMOTIVE, ['wafer.diameter="100 mm"', 'process.wafer_radius="50 mm"'])
+
+
+def test_the_size_of_the_wafer_is_stated_once_in_files_of_a_process_and_of_a_wafer(written: Callable[..., Path]):
+    process, wafer = '[process]\nlevels = 4\nlevel_step = "300 nm"\n', "[wafer]\ndies = [2, 2]\n"
+    for path in (
+        written(process + wafer + 'diameter = "150 mm"\n'),
+        written(process + 'wafer_radius = "75 mm"\n' + wafer),
+    ):
+        assert process_from_spec(load_process(path)).wafer_radius_m == 0.075
+        assert load_wafer(path).diameter_m == 0.15
+
+
+def test_reticles_of_a_stepper_stay_larger():
+    """Also where a process is written with every number given, as calibrations and pre-compensations do."""
+    stepper = STOCK["stepper"].process(Levels(16, 75e-9))
+    assert process_from_spec(spec_from_process(stepper)).reduction == stepper.reduction == 5
+    assert process_from_spec(load_spec(AUTOMOTIVE, ['process.stock="stepper"']).process).reduction == 5
+    assert process_from_spec(load_spec(AUTOMOTIVE, ["process.reduction=4"]).process).reduction == 4
+    assert "process.reduction" in refusal(load_spec, AUTOMOTIVE, ["process.reduction=0"])
+    with pytest.raises(InputError, match="process: reduction: must be 1 or more"):
+        replace(stepper, reduction=0)
 
 
 def test_a_process_in_full(written: Callable[..., Path]):

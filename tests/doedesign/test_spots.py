@@ -296,3 +296,5 @@ def test_open_periods_begin_where_most_of_them_fit():
     np.testing.assert_array_equal(open_periods(cells, (2, 3)), wanted)
     np.testing.assert_array_equal(open_periods(cells, (7, 9)), np.zeros((7, 9), bool))
     np.testing.assert_array_equal(open_periods(cells, (1, 1)), cells)
+    for none in ((9, 3), (2, 20), (0, 3)):
+        assert not open_periods(cells, none).any()

@@ -359,3 +359,6 @@ def test_a_whole_unit_cell_fits_into_an_open_part_of_a_mask(tmp_path: Path):
     assert spec_of(tmp_path, frame, "spots.period=28 um").spots is not None
     with pytest.raises(InputError, match=r"spots\.period: .*open over one whole period.*got 36 um.*Check the unit"):
         spec_of(tmp_path, frame, "spots.period=36 um")
+    for period in ("2 mm", "0.1 um"):  # more than the DOE, and no cell
+        with pytest.raises(InputError, match=r"spots\.period: "):
+            spec_of(tmp_path, frame, f"spots.period={period}")

@@ -167,7 +167,7 @@ def test_what_holds_for_silica_alone_is_left_out_for_another_material():
     page = page_of(other).text
     for words in ("16 levels in N-BK7", "This wafer is not fused silica", "Into the N-BK7, by the lab's recipe for it"):
         assert words in page
-    for words in ("CHF3", "Acetone", "selectivity of 3", "nm/min it is"):
+    for words in ("CHF3", "Acetone", "selectivity of 3", "nm/min it is", "HMDS", "xygen plasma", "Remover"):
         assert words not in page, words
         assert words in page_of(silica).text, words
     # Depths are the design's, whatever they are etched into.

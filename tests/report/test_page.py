@@ -423,6 +423,9 @@ def test_commands_to_repeat_a_run_have_their_options(run: Path):
         "--throughput-sigma 0.02 --reach 4",
         "doedesign report runs/small",
     ]
+    masks = {"obstruction": "folder", "obstruction_parameters": {"folder": "my masks"}}
+    (run / "trained" / MANIFEST_NAME).write_bytes(canonical_json(masks))
+    assert "doedesign train runs/small --obstruction 'my masks' --images PICTURES --set train.steps=3" in repeated(run)
     with results_folder(run / "fabricated", "small", run, plate="errors of my plate.toml"):
         pass
     assert "doedesign psf runs/small --fabricated --variation 'my plate.toml'" in repeated(run)

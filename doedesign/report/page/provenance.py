@@ -140,6 +140,8 @@ def _of_trained(files: RunFiles) -> Options:
     record, own = _manifest_of(folder), files.spec
     usual = {"occlusion": own.scene.occlusion, "obstruction": own.obstruction.kind if own.obstruction else None}
     found = [(key, shlex.quote(str(record[key]))) for key, value in usual.items() if record.get(key, value) != value]
+    if "folder" in (masks := _mapping(record.get("obstruction_parameters"))):
+        found = [(key, shlex.quote(str(masks["folder"])) if key == "obstruction" else value) for key, value in found]
     pictures = read_json(folder / "pictures.json") if (folder / "pictures.json").is_file() else {}
     if not {*pictures.get("training", ())} <= {path.name for path in sample_files()}:
         found.append(("images", "PICTURES"))

@@ -242,6 +242,8 @@ def open_periods(cells: Bool[np.ndarray, "y x"], period: tuple[int, int]) -> Boo
         period: cells (y, x) of one period.
     """
     (ny, nx), (height, width) = cells.shape, period
+    if not (1 <= height <= ny and 1 <= width <= nx):
+        return np.zeros((ny, nx), bool)
     sums = np.pad(cells.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     within = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
     whole = np.zeros((-(-ny // height) * height, -(-nx // width) * width), bool)  # periods that begin at a cell
