@@ -295,7 +295,7 @@ def _scaled_events(process: Process, seed: Sequence[int], side_m: float, factor:
     from scipy.stats import poisson
 
     defects, mean = process.defects, factor * side_m**2
-    rng = np.random.default_rng([*seed, process.masks])
+    rng = np.random.default_rng([*seed, process.masks + 1])  # those before are of particles and pinholes
     chances, counts = rng.random(process.masks), rng.random(process.masks + 1)
     missed, doubled = (min(factor * chance, 1.0) for chance in (defects.missed, defects.doubled))
     repeats = np.where(chances < missed, -1, np.where(chances > 1 - doubled, 1, 0))

@@ -144,7 +144,11 @@ def _spot_energies(camera: Camera, psf: Float[np.ndarray, "y x"], options: Any) 
     axis = camera.axis_m()
     centres = spot_centres_m(tuple(options["count"]), positive_place(options["spacing"], camera, "spacing"))
     centres += offset_m(options, camera, "objective")
-    apart = np.stack([np.hypot(axis[:, None] - y, axis[None, :] - x) for y, x in centres])
     # Light where discs overlap is that of the nearest spot, and counts once.
-    inside, nearest = apart.min(axis=0) <= radius, apart.argmin(axis=0)
+    least, nearest = np.full(psf.shape, np.inf), np.zeros(psf.shape, np.int64)
+    for spot, (y, x) in enumerate(centres):
+        apart = np.hypot(axis[:, None] - y, axis[None, :] - x)
+        nearest[apart < least] = spot
+        np.minimum(apart, least, out=least)
+    inside = least <= radius
     return np.bincount(nearest[inside], psf[inside].astype(np.float64), minlength=len(centres))

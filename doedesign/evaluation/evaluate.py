@@ -191,6 +191,8 @@ def _require_same_camera(design: Design, robust: Design, folder: Path) -> None:
         wanted, got = getattr(design.camera, one.name), getattr(robust.camera, one.name)
         if wanted != got:
             cure = "Give a robust design that was made from the same spec."
+            if one.name in ("light", "polarisation"):  # a robust design is made in scalar light
+                cure = 'Evaluate a run of the same spec with optics.light = "scalar".'
             raise InputError(str(folder), f"a robust design must have this camera's {one.name}, {wanted}", got, cure)
 
 

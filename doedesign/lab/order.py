@@ -156,7 +156,7 @@ def _process(given: Process | str | Path | None, levels: Levels, usual: ProcessS
     made = process_from_spec(usual)
     if made.levels == levels:
         return made
-    lithography = {key: getattr(made, key) for key in ("tone", "minimum_line_m", "minimum_space_m")}
+    lithography = {key: getattr(made, key) for key in ("tone", "minimum_line_m", "minimum_space_m", "reduction")}
     return Process(levels, name=made.name, **lithography)
 
 

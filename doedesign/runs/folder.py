@@ -21,12 +21,10 @@ process at a time works in a run folder.
 """
 
 import contextlib
-import glob
 import json
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,6 +54,7 @@ from fab.files import (
     clear_killed,
     explain_os_error,
     lock,
+    os_errors_explained,
     read_bytes,
     read_json,
     sha256_file,
@@ -204,7 +203,7 @@ def claim_run(
         if not known and any(folder.iterdir()):
             raise InputError(str(folder), "a run needs a new or empty folder, or its own", "other content", cure)
         if known and overwrite and not _belongs(_read_manifest(folder), spec, inputs):
-            _move_all(folder, Path(tempfile.mkdtemp(prefix=f"{_replaced(folder)}.", dir=folder.parent)))
+            _set_aside(folder)
             known = False
         run = Run(folder, spec, known and _is_done(folder, spec, inputs), inputs, overrides)
         if run.done:  # perhaps stopped before the last line of `finish_run`
@@ -212,32 +211,43 @@ def claim_run(
         yield run
 
 
-def _replaced(folder: Path) -> str:
-    """How the names of folders begin in which a run waits that another one is to take the place of."""
-    return f".{folder.name}.doedesign-replaced"
+# Where, in its own folder, a run waits that another one is to take the place of: on one disk, whatever links to it.
+_ASIDE = ".doedesign-replaced"
 
 
 @contextlib.contextmanager
 def _replaced_or_restored(folder: Path) -> Iterator[None]:
     """Bring back a run that nothing took the place of: a mistake was found before the other began, or it was killed."""
-
-    def restore() -> None:
-        for aside in folder.parent.glob(f"{glob.escape(_replaced(folder))}.*"):
-            if not (folder / MANIFEST_NAME).is_file():
-                _move_all(aside, folder)
-                aside.rmdir()
-
-    restore()
+    _restore(folder)
     try:
         yield
     finally:
-        restore()
+        _restore(folder)
 
 
-def _move_all(source: Path, target: Path) -> None:
-    """Move all that is in a folder into another; what says that it is a run goes last."""
-    for path in sorted(source.iterdir(), key=lambda path: path.name == MANIFEST_NAME):
-        path.rename(target / path.name)
+def _set_aside(folder: Path) -> None:
+    """Move a run aside, its manifest first, so that one of which a part was moved is known by having none."""
+    aside = folder / _ASIDE
+    with os_errors_explained(folder):
+        aside.mkdir()
+        _rename_all(sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST_NAME), aside)
+
+
+def _restore(folder: Path) -> None:
+    """Move a run back that waits, its manifest last; or remove it, if another one has begun."""
+    aside = folder / _ASIDE
+    if not aside.is_dir():
+        return
+    with os_errors_explained(folder):
+        if not (folder / MANIFEST_NAME).is_file():
+            _rename_all(sorted(aside.iterdir(), key=lambda path: path.name == MANIFEST_NAME), folder)
+        shutil.rmtree(aside)
+
+
+def _rename_all(paths: Sequence[Path], home: Path) -> None:
+    for path in paths:
+        if path != home:
+            path.rename(home / path.name)
 
 
 def _belongs(found: "_Manifest", spec: Spec, inputs: Mapping[str, str]) -> bool:
@@ -312,8 +322,7 @@ def begin_run(run: Run) -> None:
     write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
     for name, content in pictures.items():
         write_atomic(run.path(name), content)
-    for aside in run.folder.parent.glob(f"{glob.escape(_replaced(run.folder))}.*"):
-        shutil.rmtree(aside)
+    _restore(run.folder)  # there is a manifest: what waits is removed
 
 
 def finish_run(

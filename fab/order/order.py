@@ -140,7 +140,7 @@ class Order:
                     if not move or widths.smallest_m is None or widths.smallest_m < least:
                         continue  # not moved, or said already
                     printed = widths.smallest_m + 2 * sign * grown_m
-                    if printed < least - 1e-12:
+                    if printed < least - self.dbu_m - 1e-12:  # moves are whole units, on both sides
                         where = f" ({split.words})" if split.words else ""
                         found.append(
                             f"mask {mask + 1}{where}: its edges are moved so far that its narrowest {what} prints "
@@ -270,14 +270,8 @@ def plan_order(
     asked |= {"formats": formats or Formats(), "material": material}
     _require_one_wafer(made_by, wafer)
     order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
-    if made_by.name in STOCK and (said := STOCK[made_by.name].not_drawn):
+    if made_by.name in STOCK and (said := STOCK[made_by.name].not_drawn) and not direct_write:
         log.warning("process %s: %s", made_by.name, said)
-    if narrowed := order.narrowed():
-        if on_violation == "fail":
-            cure = "Move edges less, or choose another process."
-            raise InputError("masks", "the process must be able to print them", narrowed[0], cure)
-        for sentence in narrowed:
-            log.warning(sentence)
     off, address = report.off_grid, terms.address_grid_m
     if address is not None and off.edges:
         grid, worst = format_length(address), format_length(off.worst_m)
@@ -295,6 +289,12 @@ def plan_order(
         source = {**order.source, "repair": asdict(repair.cost)}
         order = replace(order, rules=repair.rules, repair=repair, source=source)
         log.info("repaired: %s", repair.cost)
+    if narrowed := order.narrowed():
+        if on_violation == "fail":
+            cure = "Move edges less, or choose another process."
+            raise InputError("masks", "the process must be able to print them", narrowed[0], cure)
+        for sentence in narrowed:
+            log.warning(sentence)
     if patch is not None:
         patch.require(order.level_map)
     return order

@@ -504,6 +504,12 @@ def test_a_robust_design_of_another_camera_is_refused(run: Path, tmp_path: Path)
     assert not (tmp_path / "out").exists()
 
 
+def test_a_robust_design_in_scalar_light_beside_one_with_edges_says_what_helps(run: Path, tmp_path: Path):
+    lit = finished_run(tmp_path, SPEC.replace("[optics]", '[optics]\nlight = "edges"'))
+    with pytest.raises(InputError, match=r'camera.s light, edges, but got scalar. .*optics\.light = "scalar"'):
+        evaluate(lit, tmp_path / "out", robust=run, train=True)
+
+
 def test_what_nothing_is_trained_for_is_scored_once(run: Path, tmp_path: Path):
     """Two seeds are no two draws of a camera without a network, nor of a robust plate that stays as it is."""
     names = ("conventional_capture", "robust_capture")

@@ -16,6 +16,7 @@ from doedesign.report.page.files import open_files
 from doedesign.runs import fabricated
 from doedesign.runs.level_maps import open_design
 from doedesign.runs.orders import is_order_of, order_of_run, own_level_map, require_replaceable
+from doedesign.spec.process import ProcessSpec
 from fab.errors import InputError
 from fab.files import canonical_json
 from fab.level_map import LevelMap
@@ -139,6 +140,13 @@ def test_plates_for_a_stepper_are_written_where_they_are_asked_for(places: list[
     assert "by --one-to-one and" in said
     call("masks", "runs/small", "--process", "stepper", "--one-to-one")
     assert places == [Path("masks/small")]
+
+
+def test_a_stepper_is_one_whatever_the_levels():
+    usual = ProcessSpec(levels=4, level_step_m=300e-9, stock="stepper")
+    for levels in (Levels(4, 300e-9), Levels(8, 150e-9)):
+        made = lab._process(None, levels, usual)
+        assert (made.levels, made.reduction) == (levels, 5)
 
 
 @pytest.mark.usefixtures("work")

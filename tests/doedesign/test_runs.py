@@ -104,7 +104,7 @@ def test_another_spec_overwrites_on_request_alone(done: Run, spec: Spec, tmp_pat
         assert (run.folder / "psf" / "manifest.json").is_file()
     with claim_run(done.folder, changed, {}, overwrite=True) as run:
         assert not run.done
-        assert list(run.folder.iterdir()) == []
+        assert [path.name for path in run.folder.iterdir()] == [".doedesign-replaced"]
     assert (tmp_path / "kept.txt").read_text() == "mine"
 
 
@@ -195,18 +195,54 @@ def test_a_run_comes_back_where_nothing_takes_its_place(done: Run, spec: Spec):
     with pytest.raises(InputError, match="mistake"), claim_run(done.folder, changed, {}, overwrite=True):
         raise InputError("objective", "mistake", "one", "Correct it.")
     assert {path.name for path in done.folder.iterdir()} == before
-    # Killed before the other run began.
-    aside = done.folder.parent / f".{done.folder.name}.doedesign-replaced.abcd_123"
-    aside.mkdir()
-    for path in list(done.folder.iterdir()):
-        path.rename(aside / path.name)
-    with claim_run(done.folder, spec, {}) as run:
-        assert run.done
-    assert {path.name for path in done.folder.iterdir()} == before
     with claim_run(done.folder, changed, {}, overwrite=True) as run:
         begin_run(run)
         assert {path.name for path in done.folder.iterdir()} == {"manifest.json", "spec.toml"}
-    assert [path.name for path in done.folder.parent.iterdir() if "replaced" in path.name] == []
+
+
+@pytest.mark.parametrize("moves", range(4))
+def test_a_run_comes_back_wherever_a_kill_fell(done: Run, spec: Spec, moves: int, monkeypatch: pytest.MonkeyPatch):
+    """After so many files were moved aside; and then after so many were moved back."""
+    changed, rename, left = spec.model_copy(update={"name": "another"}), Path.rename, moves
+    before = {path.name: path.read_bytes() for path in done.folder.iterdir()}
+
+    def killed(path: Path, target: Path) -> Path:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise Killed
+        return rename(path, target)
+
+    def overwritten() -> None:
+        with claim_run(done.folder, changed, {}, overwrite=True):
+            raise Killed
+
+    for _ in range(2):
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "rename", killed)
+            with pytest.raises(Killed):
+                overwritten()
+        left = moves + 1
+    with claim_run(done.folder, spec, {}) as run:
+        assert run.done
+    assert {path.name: path.read_bytes() for path in done.folder.iterdir()} == before
+
+
+def test_a_run_behind_a_link_and_the_current_folder_can_be_overwritten(
+    done: Run, spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "run"
+    link.symlink_to(done.folder.resolve())
+    monkeypatch.chdir(done.folder)
+    for folder, name in ((link, "another"), (Path(), "a third")):
+        with claim_run(folder, spec.model_copy(update={"name": name}), {}, overwrite=True) as run:
+            begin_run(run)
+            assert {path.name for path in folder.iterdir()} == {"manifest.json", "spec.toml"}
+
+
+class Killed(BaseException):
+    """In place of a signal that no process survives."""
 
 
 def test_only_temporary_files_are_cleared_away(run: Run):

@@ -158,6 +158,20 @@ def test_a_budget_for_rare_events_scales_their_rates(process: Process):
     assert budget_keys("defects", (1.0,), 2) == ["budget/defects/1/0", "budget/defects/1/1"]
 
 
+def test_rare_events_of_a_budget_are_independent(process: Process):
+    """Where a pinhole lies says nothing of whether an etch was missed."""
+    defects = Defects(missed=0.5, pinholes_per_m2=1e6)
+    rare = dataclasses.replace(process, defects=defects)
+    found = [plate(rare, f"budget/defects/1/{i}") for i in range(400)]
+    sides: dict[bool, list[bool]] = {True: [], False: []}
+    for one in found:
+        if one.pinholes:
+            sides[bool(one.repeats) and one.repeats[0] == -1].append(one.pinholes[0].y_m > 0)
+    # Some 100 or more each; half of them strays by 5 %.
+    for side in sides.values():
+        assert 0.3 < np.mean(side) < 0.7
+
+
 @pytest.mark.parametrize(
     ("what", "count"),
     [("overlay", 2), ("overlay_x", 2), ("overlay_x_m", 2), ("overlay_x[1]", 1), ("overlay_x_m[1]", 1), ("defects", 0)],

@@ -154,6 +154,28 @@ def test_moved_edges_must_leave_what_the_process_prints(tmp_path, caplog):
                 plan_order(plate, process=process, wafer=wafer, on_violation="fail")
 
 
+@pytest.mark.parametrize("bias_m", [123.4e-9, -123.6e-9, 100e-9])
+def test_a_bias_that_is_no_whole_number_of_units_can_be_made_up_for(bias_m: float):
+    """Edges move by whole units: up to half of one is left on either side of a line."""
+    stripes = np.tile([0, 1], (32, 16)).astype(np.uint8)
+    plate = wide_map(stripes, Levels(2, 600e-9), Grid((32, 32), 1e-6), "s")
+    spreads = {"common_cd_bias_m": Normal(bias_m, 0.0)}
+    process = Process(Levels(2, 600e-9), minimum_line_m=1e-6, minimum_space_m=1e-6, spreads=spreads)
+    assert plan_order(plate, process=process, wafer=Wafer(compensate=True), on_violation="fail").narrowed() == ()
+
+
+def test_moved_edges_of_a_repaired_map_are_checked(caplog):
+    """Lines that the process cannot print are widened to what it can, and then made narrower by a split."""
+    level = np.tile(np.repeat([0, 1], 4), (32, 4)).astype(np.uint8)
+    level[:, 5] = 0  # leaves a line of one pixel
+    plate = wide_map(level, Levels(2, 600e-9), Grid((32, 32), 1e-6), "s")
+    process = Process(Levels(2, 600e-9), minimum_line_m=2e-6, minimum_space_m=2e-6)
+    order = plan_order(plate, process=process, wafer=Wafer(line_splits_m=(-0.6e-6,)), on_violation="fix")
+    assert order.rules.clean
+    assert any("edges are moved so far" in message for message in caplog.messages) == bool(order.narrowed())
+    assert order.narrowed()
+
+
 def test_lines_off_the_grid_of_the_mask_writer_are_told(caplog):
     plate = wide_map(np.zeros((8, 8), np.uint8), Levels(2, 600e-9), Grid((8, 8), 1.03e-6), "s")
     plan_order(plate)

@@ -114,6 +114,9 @@ def test_an_order_for_a_process_without_contact_masks_says_so(name, caplog):
     plan_order(plate, process=name, one_to_one=True)
     told = [message for message in caplog.messages if message.startswith(f"process {name}: ")]
     assert len(told) == (name == "direct_write")
+    caplog.clear()
+    plan_order(plate, process=name, one_to_one=True, direct_write=True)
+    assert not [message for message in caplog.messages if message.startswith(f"process {name}: ")]
     if name == "stepper":
         with pytest.raises(InputError, match="reticles hold one die, 5 times as large"):
             plan_order(plate, process=name)
