@@ -11,6 +11,7 @@ from doedesign import __version__
 from doedesign.capture.images import sample_files
 from doedesign.report.page.blocks import CommandBlock, PageBlock, PageSection, TableBlock, TextBlock, section
 from doedesign.report.page.files import RunFiles, listed_bytes, listed_json
+from doedesign.spec import overrides_told
 from fab.files import MANIFEST_NAME, read_bytes, read_json
 from fab.units import format_length
 from sim.store import read_stored_bank
@@ -147,7 +148,7 @@ def _of_trained(files: RunFiles) -> Options:
         found.append(("images", "PICTURES"))
     spec = folder / "spec.toml"
     text = read_bytes(spec).decode(errors="replace") if spec.is_file() else ""
-    return *found, *(("set", shlex.quote(one)) for one in re.findall(r"^# --set (.+)$", text, re.MULTILINE))
+    return *found, *(("set", shlex.quote(one)) for one in overrides_told(text))
 
 
 def _of_evaluation(files: RunFiles) -> tuple[Options, ...]:
