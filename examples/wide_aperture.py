@@ -22,9 +22,9 @@ each at its best strength (`wide_plates.py`). Written to OUT:
 
 Light goes through the aperture part by part (`sim.imaging.parts`), for a shadow on a wide aperture changes its PSF.
 `doedesign train` is not used, for its scenes are mirrored at their edges and these shadows are wider than the pictures;
-network, loss and Adam's step are its own. Work that was stopped goes on with the same command; under two hours on
-two cores. `examples/results` has what it left: trained on 120 photographs of BSDS500's training set, judged on 32 of
-its validation set.
+network, loss and Adam's step are its own. Work that was stopped goes on with the same command; some 17 minutes of one
+core for a camera. `examples/results` has what it left: trained on 120 photographs of BSDS500's training set, judged on
+32 of its validation set.
 """
 
 import argparse

@@ -27,7 +27,7 @@ Reading order, from the substance to the picture:
 
 Conventions (pinned by tests/sim/test_conventions.py):
 
-* SI units; arrays `[y, x]`, row 0 at the lowest y; PSF banks `[wavelength, depth, y, x]`.
+* SI units; arrays `[y, x]`, row 0 at the lowest y; PSF banks `[colour, depth, y, x]`.
 * Grids are centred: coordinate (i - (n-1)/2) * pitch, so the axis lies between samples for even n.
 * Fields vary as exp(+ikz); more optical path means more phase, exp(+i phi). A surface that
   thickens toward +y sends light to +y.

@@ -40,7 +40,7 @@ class PsfBank(eqx.Module):
     """PSFs of one optical system, on one field angle.
 
     Attributes:
-        energy: `[wavelength, depth, y, x]` energy per pixel per unit power incident on the clear aperture; numpy, or
+        energy: `[colour, depth, y, x]` energy per pixel per unit power incident on the clear aperture; numpy, or
             jax where it is traced.
         colours: name of each entry of the first axis.
         depths_m: source depth of each entry of the second axis, metres.
@@ -87,7 +87,7 @@ class PsfBank(eqx.Module):
         return MetricInputs(self.energy, self.depths_m, self.camera, near_m, doe, nominal, lens and lens.energy, aimed)
 
     def metric(self, name: str) -> Table:
-        """A metric of `sim.metrics.METRICS` that needs nothing but PSFs and their camera, `[wavelength, depth]`.
+        """A metric of `sim.metrics.METRICS` that needs nothing but PSFs and their camera, `[colour, depth]`.
 
         A ValueError for another one.
         """
@@ -99,23 +99,23 @@ class PsfBank(eqx.Module):
         return stacked([stacked([of(inputs, c, d) for d in depths]) for c in range(len(self.colours))])
 
     def throughput(self) -> Table:
-        """Energy in the window, `[wavelength, depth]`."""
+        """Energy in the window, `[colour, depth]`."""
         return self.metric("throughput")
 
     def far_spot(self) -> Table:
-        """Energy in the far spot (`sim.metrics.spot_radius_m`), `[wavelength, depth]`."""
+        """Energy in the far spot (`sim.metrics.spot_radius_m`), `[colour, depth]`."""
         return self.metric("far_spot")
 
     def ring_to_disc(self) -> Table:
-        """Energy outside over energy inside the geometric defocus disc, `[wavelength, depth]`."""
+        """Energy outside over energy inside the geometric defocus disc, `[colour, depth]`."""
         return self.metric("ring_to_disc")
 
     def participation(self) -> Float[Array, "w d"]:
-        """Sum of squared pixel energies, `[wavelength, depth]`."""
+        """Sum of squared pixel energies, `[colour, depth]`."""
         return participation(self.energy)
 
     def encircled_energy(self, radii_m: Sequence[float]) -> Float[np.ndarray, "w d r"] | Float[Array, "w d r"]:
-        """Energy within centred discs of some radii (metres), `[wavelength, depth, radius]`."""
+        """Energy within centred discs of some radii (metres), `[colour, depth, radius]`."""
         return encircled_energy(self.energy, self.pixel_m, radii_m)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":

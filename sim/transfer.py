@@ -39,7 +39,7 @@ class TransferBank:
     """MTF along x for every colour and depth.
 
     Attributes:
-        transfer: `[wavelength, depth, frequency]` |OTF|, 1 at frequency 0.
+        transfer: `[colour, depth, frequency]` |OTF|, 1 at frequency 0.
         frequencies_per_m: spatial frequencies on the sensor, cycles per metre.
         depths_m: source depths, metres.
         camera: lens, sensor and substrate.

@@ -22,6 +22,8 @@ import wide_aperture  # pyright: ignore[reportMissingImports]
 import wide_cameras  # pyright: ignore[reportMissingImports]
 import wide_plates  # pyright: ignore[reportMissingImports]
 
+ROOT = Path(__file__).parents[2]
+
 
 @pytest.mark.parametrize(("nearest_m", "waves"), [(1.0, 14.8), (2.0, 7.4), (5.0, 3.0)])
 def test_a_plain_wide_aperture_is_out_of_focus_at_both_ends(nearest_m: float, waves: float):
@@ -99,6 +101,39 @@ def test_plates_as_fabricated_are_judged_together():
     name = "plate / as fabricated / filter / 1.0 over stop"
     assert found["worst depth, plate over rival"][name][:3] == pytest.approx([2.5, 2.5, 2.5])
     assert found["mean of the depths, plate over rival"][name][:3] == pytest.approx([2.25, 2.25, 2.25])
+
+
+@pytest.mark.parametrize(("name", "way"), [("wide_aperture", "network"), ("wide_aperture_bars", "filter")])
+def test_the_page_has_the_means_of_the_scores(name: str, way: str):
+    """Of both tables, and the differences at the worst depth, picture by picture."""
+    text = (ROOT / "examples" / "results" / f"{name}.csv").read_text()
+    rows = [
+        wide_aperture.Judged(
+            one["camera"],
+            one["plate"],
+            one["way"],
+            float(one["light"]),
+            float(one["depth_m"]),
+            int(one["scene"]),
+            one["picture"],
+            float(one["psnr"]),
+        )
+        for one in csv.DictReader(text.splitlines())
+    ]
+    found = wide_aperture.summary_of(rows)
+    page = " ".join((ROOT / "docs" / "tasks" / "wide-aperture.md").read_text().split()).replace("**", "")
+    for camera in ("stop", "f2", "open", "plate", "quartic", "cubic", "logarithmic_asphere"):
+        told = []
+        for which in [(way, 1.0), ("filter", 1.0), (way, 0.1)]:
+            one = found["scores"][f"{camera} / drawn / {which[0]} / {which[1]}"]
+            told.append(" / ".join(f"{one[depth]:.1f}" for depth in ("2", "4", "inf")))
+        if way == "filter":
+            told[1] = f"{found['scores'][f'{camera} / drawn / filter / 1.0']['mean']:.1f}"
+        assert f"| {' | '.join(told)} |" in page, camera
+    over = found["worst depth, plate over rival"]
+    for rival in ("stop", "f2", "open", "quartic", "cubic", "logarithmic_asphere"):
+        mean, low, high, _ = over[f"plate / as fabricated / {way} / 1.0 over {rival}"]
+        assert f"{mean:.1f} ({low:.1f} to {high:.1f})" in page.replace(" dB", ""), rival
 
 
 def test_the_spec_says_what_is_designed():
