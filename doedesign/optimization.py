@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.capture.from_spec import obstruction_from_spec
+from doedesign.capture.from_spec import require_options
 from doedesign.design.accuracy import accuracies, in_words
 from doedesign.design.descent import descend
 from doedesign.design.design import Design
@@ -106,8 +106,7 @@ def optimize(
         spec = load_spec(spec.file or "" if isinstance(spec, Spec) else spec, overrides)
     for warning in spec_warnings(spec):
         log.warning(warning)
-    if spec.obstruction is not None:  # its mistakes are not first told when captures are made
-        obstruction_from_spec(spec, str(spec.file or spec.name))
+    require_options(spec, str(spec.file or spec.name))  # not first when captures are made
     files = input_files(spec)
     if out is not None:
         return _optimize_in(Path(out), spec, files, overrides, objectives or {}, overwrite)

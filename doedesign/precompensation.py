@@ -52,7 +52,7 @@ from fab.files import canonical_json, csv_table, sha256_bytes, write_atomic
 from fab.layout.geometry import pixel_edges
 from fab.layout.polygons import smallest_runs
 from fab.levels import Levels, planes
-from fab.process import Normal, Process, Variation
+from fab.process import OVER_THE_WAFER, Normal, Process, Variation
 from fab.units import NM, format_length
 from sim.metrics import participation, without_infinities
 from sim.optic import CellOptic, HeightOptic
@@ -353,13 +353,13 @@ def _miss(design: Design, spec: Spec, plate: FabricatedDoe) -> float:
 
 
 def _on_wafer(process: Process, spec: Spec) -> Process:
-    """The process on the wafer of a spec; where the DOE lies in the middle of any, that changes nothing."""
+    """The process on the wafer of a spec, whose size matters only to depths that differ over it."""
     radius_m = spec.wafer.diameter_m / 2
     if abs(process.wafer_radius_m - radius_m) < _SAME_M:
         return process
-    if any(process.die_m):
-        rule = f"must be for the wafer of the run, of radius {format_length(radius_m)}"
-        cure = "Say where on this wafer the DOE lies, or optimise for the wafer of the process."
+    if any(process.spreads.get(name, Normal()) != Normal() for name in OVER_THE_WAFER):
+        rule = f"must be for the wafer of the run, of radius {format_length(radius_m)}, where depths differ over it"
+        cure = "Calibrate for this wafer, or optimise for the wafer of the process."
         raise InputError("process: wafer_radius_m", rule, format_length(process.wafer_radius_m), cure)
     return replace(process, wafer_radius_m=radius_m)
 

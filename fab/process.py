@@ -83,6 +83,10 @@ class Defects:
             raise InputError("defects", "missed and doubled must sum to at most 1", got, "Lower one of them.")
 
 
+# Errors by which depths differ over the wafer.
+OVER_THE_WAFER = ("radial_nonuniformity", "linear_nonuniformity_y", "linear_nonuniformity_x")
+
+
 @dataclass(frozen=True)
 class Process:
     """Etches that a fab lab makes, and how well; lengths in metres.
@@ -165,8 +169,7 @@ class Process:
     def depth_at_die(self) -> float:
         """Depth of an etch at the middle of the DOE over that at the middle of the wafer, by mean non-uniformity."""
         y, x = (at / self.wafer_radius_m for at in self.die_m) if any(self.die_m) else (0.0, 0.0)
-        names = ("radial_nonuniformity", "linear_nonuniformity_y", "linear_nonuniformity_x")
-        bowl, tilt_y, tilt_x = (self.spreads.get(name, Normal()).mean for name in names)
+        bowl, tilt_y, tilt_x = (self.spreads.get(name, Normal()).mean for name in OVER_THE_WAFER)
         return 1 + bowl * (y * y + x * x) + (tilt_y * y + tilt_x * x)
 
     def expected(self) -> Variation:

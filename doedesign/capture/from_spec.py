@@ -114,17 +114,39 @@ def obstruction_from_spec(
         parameters["folder"] = str(beside if beside.is_dir() else parameters["folder"])
     made = _made(kind, parameters, where)
     near = near_m if spec is None else spec.scene.near_m
-    return at_depth(made, (min(near), max(near)), options) if near else made
+    if not near:
+        return made
+    try:
+        return at_depth(made, (min(near), max(near)), options)
+    except InputError as error:
+        place = "near_m" if spec is None else f"{source}: scene.near"
+        cure = "Move them, or give the obstruction a depth of its own."
+        raise InputError(place, f"where obstructions lie {error.rule}", error.got, cure) from error
 
 
-def _made(kind: Any, parameters: Mapping[str, Any], where: str) -> Any:
-    """A kind with parameters in SI, whose mistakes name the options' place."""
+def require_options(spec: Spec, source: str) -> None:
+    """Refuse options that are none of the obstruction of a spec; masks of a folder are not looked for.
+
+    Args:
+        spec: the spec.
+        source: name of its file for messages.
+
+    Raises:
+        InputError: as `obstruction_from_spec`.
+    """
+    own = spec.obstruction
+    if own is not None and OBSTRUCTIONS.get(own.kind) is not MaskFolder:
+        obstruction_from_spec(spec, source)
+
+
+def _made(kind: Any, parameters: Mapping[str, Any], where: str, within: str = "") -> Any:
+    """A kind with parameters in SI, whose mistakes name the option; those of a part begin with its name (`within`)."""
     try:
         return kind(**parameters)
     except InputError as error:
         name, _, parameter = error.where.partition(": ")
         key = parameter.removesuffix("_m").removesuffix("_rad")
-        place = f"{where}.{key}" if name == kind.name and key else f"{where}: {error.where}"
+        place = f"{where}.{within}{key}" if name == kind.name and key else f"{where}: {error.where}"
         raise InputError(place, error.rule, error.got, error.cure) from error
     except TypeError as error:  # a parameter without which there is nothing
         raise InputError(where, "must hold all that the kind needs", f'"{error}"', "Add it.") from error
@@ -144,7 +166,9 @@ def at_depth(
     return replace(kind, **{name: at_depth(part, depth_m, options, f"{name}_") for name, part in parts.items()})
 
 
-def _parameters(kind: type[ObstructionKind], options: Mapping[str, Any], where: str) -> dict[str, Any]:
+def _parameters(
+    kind: type[ObstructionKind], options: Mapping[str, Any], where: str, within: str = ""
+) -> dict[str, Any]:
     """Options of a spec as parameters in SI; those that begin with the name of a part of a mixed kind make that."""
     # What makes no other kind of it, such as a function to call, is none of its parameters.
     own = [field for field in fields(cast("Any", kind)) if field.init and field.compare]
@@ -157,13 +181,14 @@ def _parameters(kind: type[ObstructionKind], options: Mapping[str, Any], where: 
         if part is not None:
             inner.setdefault(part, {})[key.removeprefix(f"{part}_")] = value
         elif key in known:
-            found[known[key].name] = _parameter(known[key], value, f"{where}.{key}")
+            found[known[key].name] = _parameter(known[key], value, f"{where}.{within}{key}")
         else:
-            raise InputError(where, "must be parameters of this kind", f"`{key}`", nearest(key, tuple(known)))
+            cure = nearest(f"{within}{key}", [f"{within}{name}" for name in known])
+            raise InputError(where, "must be parameters of this kind", f"`{within}{key}`", cure)
     for part, given in inner.items():
         of_part = cast("type[ObstructionKind]", parts[part])
-        beside = f"{where} of {part}"
-        found[part] = _made(of_part, _parameters(of_part, given, beside), beside)
+        inside = f"{within}{part}_"
+        found[part] = _made(of_part, _parameters(of_part, given, where, inside), where, inside)
     return found
 
 

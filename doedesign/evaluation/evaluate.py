@@ -34,7 +34,7 @@ from doedesign.evaluation.plates import PlateBanks, plates_of
 from doedesign.evaluation.rows import FLAT, MethodRow, rows_of, trainings_of
 from doedesign.evaluation.scoring import PairWork, RowScores, ScoreLines
 from doedesign.evaluation.tables import EvaluationTable, PairFacts, folder_name, table_of, write_table
-from doedesign.evaluation.trainings import TrainingPlan, claim_trainings, lacking, train_missing
+from doedesign.evaluation.trainings import TrainingPlan, lacking, require_asked, train_missing
 from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.journal import Journal
 from doedesign.runs.level_maps import open_design
@@ -151,7 +151,7 @@ def evaluate(
             lpips_weights=tuple(lpips_weights),
         )
         needed = trainings_of(chosen)
-        claim_trainings(plan, design, add=train)
+        require_asked(plan, needed, seeds, pictures=train or images is not None, loss=train)
         if train:
             train_missing(plan, needed, seeds, workers)
         missing = lacking(plan, needed, seeds)

@@ -1,14 +1,14 @@
 """Networks that rows of a table need: found where they are finished, trained where that is asked for.
 
-    OUT/trained/asked.json                          spec, plates, pictures and obstructions of all trainings there
     OUT/trained/OCCLUSION/OBSTRUCTION/NAME_SEED/    a training as `doedesign train` writes it, or that of a rival
 
 A finished training of the design's own run (`RUN/trained`, or a released model) with the same seed, occlusion model and
 obstruction stands for "proposed". All are trained on the same pictures, with the steps, sizes and seeds of the
-design's spec; others are refused, for they are found by their names. On a processor several are trained side by side,
-each by a process with one thread: a training keeps little more than one core busy, however many there are.
+design's spec; others in OUT are refused. On a processor several are trained side by side, each by a process with one
+thread: a training keeps little more than one core busy, however many there are.
 """
 
+import json
 import logging
 import os
 import threading
@@ -21,23 +21,19 @@ from typing import Any, ClassVar
 
 import jax
 
-from doedesign.capture.from_spec import obstruction_from_spec, plain_parameters
-from doedesign.capture.images import Pictures, picture_files
 from doedesign.design.design import Design
-from doedesign.evaluation.rivals.training import train_rival
+from doedesign.evaluation.rivals.training import rival_named, rival_options, train_rival
 from doedesign.evaluation.rows import ROBUST, Training
 from doedesign.recon.weights import NETWORK_NAME, read_network
 from doedesign.runs.folder import RELEASED, TRAINING_TABLES, open_run
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.pool import default_workers, evaluate_here
 from doedesign.runtime.progress import meter
-from doedesign.spec import spec_digest
 from doedesign.training.history import HISTORY_NAME
-from doedesign.training.train import train
+from doedesign.training.train import prepared, train
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes, write_atomic
+from fab.files import MANIFEST_NAME, canonical_json, read_json
 
-ASKED_NAME = "asked.json"
 _TRAINING_BYTES = 4 << 30  # an estimate: a training at its peak, crops of 256 pixels
 _log = logging.getLogger("doedesign")
 
@@ -111,37 +107,58 @@ class TrainingPlan:
         return (*self.overrides, f"train.seed={seed}", *training.changes)
 
 
-def claim_trainings(plan: TrainingPlan, design: Design, *, add: bool) -> None:
-    """Refuse trainings that were made of something else, and keep what those that are added are made of.
+def require_asked(
+    plan: TrainingPlan, trainings: Iterable[Training], seeds: Sequence[int], *, pictures: bool, loss: bool
+) -> None:
+    """Refuse finished trainings that were made of something else than what is asked for, which their names do not say.
+
+    Of one in the run's own folder that is said, not refused: it was made for itself.
 
     Args:
         plan: what they have in common.
-        design: the design of the run, with the plan's changes.
-        add: whether some will be trained; otherwise their pictures do not matter.
+        trainings: the trainings.
+        seeds: seeds of each.
+        pictures: whether pictures to train on are given, so that they matter.
+        loss: whether weights of LPIPS are for training, too.
 
     Raises:
-        InputError: trainings of another spec, plate or other pictures.
+        InputError: a training of another spec, plate, obstruction, loss or other pictures.
     """
-    assert design.spec is not None  # every run has one
-    asked = {"spec_sha256": spec_digest(design.spec), "level_map_sha256": design.level_map.digest}
-    parameters = plain_parameters(obstruction_from_spec(design.spec, str(plan.run / "spec.toml"), plan.obstruction))
-    asked[f"{Path(plan.obstruction).name}_sha256"] = sha256_bytes(canonical_json(parameters))
-    if plan.robust is not None:
-        asked["robust_level_map_sha256"] = open_design(plan.robust, False).level_map.digest
-    if add:
-        asked["pictures_sha256"] = Pictures(tuple(picture_files(plan.images))).digest()
-    path = plan.out / "trained" / ASKED_NAME
-    if not path.is_file() or all(other == path for other in path.parent.iterdir()):
-        if add:
-            write_atomic(path, canonical_json(asked))
-        return
-    found = read_json(path)
-    if different := [key.removesuffix("_sha256") for key, value in asked.items() if found.get(key, value) != value]:
-        rule = "networks of a table must be trained with one spec, plate, set of pictures and kind of obstruction"
-        got = f"those with other {', '.join(different).replace('_', ' ')}"
-        raise InputError(str(path.parent), rule, got, "Choose another folder, or remove them.")
-    if add:
-        write_atomic(path, canonical_json({**found, **asked}))
+    keys = ["spec_sha256", "obstruction_parameters"]
+    keys += ["pictures_sha256", "held_out_sha256"] if pictures else []
+    keys += ["perceptual_sha256"] if loss else []
+    for one, seed in ((one, seed) for one in trainings for seed in seeds):
+        if not plan.done(one, seed) or (one.after and not plan.done(Training(one.after), seed)):
+            continue
+        rival = None if one.rival is None else rival_named(one.rival)
+        made = prepared(
+            plan.design(one, seed),
+            plan.images,
+            plan.validation,
+            plan.occlusion,
+            plan.obstruction,
+            plan.lpips_weights if loss else (),
+            plan.licence,
+            {} if rival is None else rival_options(rival),
+        )
+        folder = plan.folder(one, seed)
+        found, wanted = read_json(folder / MANIFEST_NAME), json.loads(canonical_json(made.settings))
+        looked_at = keys if rival is not None else [*keys, "height_sha256"]
+        if not (different := [key for key in looked_at if found.get(key, wanted[key]) != wanted[key]]):
+            continue
+        what = ", ".join(map(_in_words, different))
+        if not folder.is_relative_to(plan.out / "trained"):
+            _log.warning("%s stands for %s; what is asked for differs from it in its %s", folder, one.name, what)
+            continue
+        rule = f"must be the training {one.name} that is asked for"
+        cure = "Choose another folder for all, or remove this training."
+        raise InputError(str(folder), rule, f"one that differs in its {what}", cure)
+
+
+def _in_words(key: str) -> str:
+    return {"height_sha256": "plate", "obstruction_parameters": "obstruction"}.get(
+        key, key.removesuffix("_sha256").replace("_", " ")
+    )
 
 
 def _is_finished(folder: Path) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from doedesign.overview.kinds import TABLE_NAME, Record, has_record, record_of
 from doedesign.overview.numbers import MainNumber, main_numbers
 from doedesign.runs.costs import Cost, costs_of, together
-from doedesign.runs.folder import CHECKPOINT
+from doedesign.runs.folder import CHECKPOINT, waits
 from doedesign.runs.journal import STUDY_NAME
 from doedesign.spec import load_spec
 from fab.archive import read_archive
@@ -88,9 +88,13 @@ def _folders_in(folder: Path) -> list[Path]:
 
 def _without_record(folder: Path) -> Iterator[Entry]:
     """Results in a folder that is none itself; an entry of the folder where there are none."""
-    inside = [path for path in _folders_in(folder) if has_record(path)]
+    if waits(folder):
+        about = "waits to be replaced; the next optimize with its spec brings it back"
+        yield Entry(folder, "run", folder.name, "stopped", about, (), _changed(folder), _size(folder))
+        return
+    inside = [path for path in _folders_in(folder) if has_record(path) or waits(path)]
     for path in inside:
-        yield from _entries(path, 0)
+        yield from _entries(path, 0) if has_record(path) else _without_record(path)
     try:
         state, about = "not ours" if any(folder.iterdir()) else "", f"no {MANIFEST_NAME}"
     except OSError as error:

@@ -275,7 +275,6 @@ FOLDERS: tuple[WrittenFolder, ...] = (
             WrittenFile("table*/scores.jsonl", "a line per finished score"),
             WrittenFile("table*/external/*", "pairs for other programs, and what they make of them"),
             WrittenFile("trained/*", "networks that rows of the tables need, each as in RUN/trained/"),
-            WrittenFile("trained/asked.json", "SHA-256 of spec, plate and pictures of all that were trained"),
             WrittenFile("pictures/*", "sample photographs, where no folder is given"),
             WrittenFile("figure4/plates.csv", "a row per plate and colour: light, concentration, modulation transfer"),
             WrittenFile("figure8/depths.csv", "a row per plate and depth: ring:disc, light, 0th order"),

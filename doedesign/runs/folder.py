@@ -17,7 +17,8 @@
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
-process at a time works in a run folder.
+process at a time works in a run folder. A run that another one is to take the place of waits in `.doedesign-aside`
+until that one has begun.
 """
 
 import contextlib
@@ -211,8 +212,14 @@ def claim_run(
         yield run
 
 
-# Where, in its own folder, a run waits that another one is to take the place of: on one disk, whatever links to it.
-_ASIDE = ".doedesign-replaced"
+# Where, in its own folder, a run waits that another one is to take the place of, and what is left of one that was
+# replaced: on one disk, whatever links to it.
+_ASIDE, _REPLACED = ".doedesign-aside", ".doedesign-replaced"
+
+
+def waits(folder: Path) -> bool:
+    """Whether a run that was to be replaced waits in its folder to be brought back, which the next `optimize` does."""
+    return (folder / _ASIDE / MANIFEST_NAME).is_file()
 
 
 @contextlib.contextmanager
@@ -226,22 +233,33 @@ def _replaced_or_restored(folder: Path) -> Iterator[None]:
 
 
 def _set_aside(folder: Path) -> None:
-    """Move a run aside, its manifest first, so that one of which a part was moved is known by having none."""
+    """Move a run aside, its manifest first: what is there without one is no run."""
     aside = folder / _ASIDE
     with os_errors_explained(folder):
         aside.mkdir()
         _rename_all(sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST_NAME), aside)
 
 
+def _replace(folder: Path) -> None:
+    """Remove the run that waits, for another one has begun; from the first step on it does not come back."""
+    if (folder / _ASIDE).is_dir():
+        with os_errors_explained(folder):
+            (folder / _ASIDE).rename(folder / _REPLACED)
+            shutil.rmtree(folder / _REPLACED)
+
+
 def _restore(folder: Path) -> None:
-    """Move a run back that waits, its manifest last; or remove it, if another one has begun."""
+    """Move a run back that waits, its manifest last, over what another one began with."""
     aside = folder / _ASIDE
-    if not aside.is_dir():
-        return
     with os_errors_explained(folder):
-        if not (folder / MANIFEST_NAME).is_file():
-            _rename_all(sorted(aside.iterdir(), key=lambda path: path.name == MANIFEST_NAME), folder)
-        shutil.rmtree(aside)
+        if (folder / _REPLACED).is_dir():
+            shutil.rmtree(folder / _REPLACED)
+        if not aside.is_dir():
+            return
+        if waits(folder):
+            (folder / MANIFEST_NAME).unlink(missing_ok=True)
+        _rename_all(sorted(aside.iterdir(), key=lambda path: path.name == MANIFEST_NAME), folder)
+        aside.rmdir()
 
 
 def _rename_all(paths: Sequence[Path], home: Path) -> None:
@@ -322,7 +340,7 @@ def begin_run(run: Run) -> None:
     write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
     for name, content in pictures.items():
         write_atomic(run.path(name), content)
-    _restore(run.folder)  # there is a manifest: what waits is removed
+    _replace(run.folder)
 
 
 def finish_run(
@@ -352,7 +370,10 @@ def open_run(folder: Path) -> Run:
     """
     require_folder(folder)
     if not (folder / MANIFEST_NAME).is_file():
-        raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
+        cure = "Give the folder optimize wrote."
+        if waits(folder):
+            cure = f"A run waits in {_ASIDE}; the next optimize with its spec brings it back."
+        raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", cure)
     _require_no_order(folder)
     manifest = _read_manifest(folder, (FORMAT, TRAINING, RELEASED))
     path = folder / "spec.toml"

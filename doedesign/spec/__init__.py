@@ -41,7 +41,6 @@ from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
 from doedesign.spec.robust import RobustSpec
 from doedesign.spec.text import (
-    overrides_told,
     process_to_toml,
     spec_digest,
     spec_to_json,

@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,7 +15,6 @@ from fab.files import canonical_json, sha256_bytes
 from fab.process import Variation
 from fab.units import parse_angle
 
-_CHANGED = "--set "
 _FILLED_IN = "defaults are filled in; optional keys that are not here have their usual values"
 
 
@@ -43,12 +41,7 @@ def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
 
 def spec_to_resolved_toml(spec: Spec, overrides: Sequence[str]) -> str:
     """Write the spec of a run; the head of the file tells the overrides, "table.key=value", that led to it."""
-    return spec_to_toml(spec, [_FILLED_IN, *(f"{_CHANGED}{override}" for override in overrides)])
-
-
-def overrides_told(text: str) -> tuple[str, ...]:
-    """Return the overrides that the head of a run's spec tells of (`spec_to_resolved_toml`)."""
-    return tuple(re.findall(rf"^# {_CHANGED}(.+)$", text, re.MULTILINE))
+    return spec_to_toml(spec, [_FILLED_IN, *(f"--set {override}" for override in overrides)])
 
 
 def process_to_toml(process: ProcessSpec, comments: Sequence[str] = ()) -> str:

@@ -124,19 +124,14 @@ def train(
         _log.info("preparing propagation")
         at_rest, mesh = design.nominal_height_m, devices_mesh(devices)
         trainer = Trainer.of(spec, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
-        settings = {
-            "format": TRAINING,
-            "height_sha256": _height_digest(design),
-            "camera": how.camera,
-            **made.settings,
-        }
+        settings = {"format": TRAINING, "camera": how.camera, **made.settings}
         resolved = spec_to_resolved_toml(spec, overrides).encode()
         job = JointTraining(
             name="training",
             title=spec.name,
             options=how,
             settings=settings,
-            remarks={"licence": licence},
+            remarks={"licence": licence, "overrides": list(overrides)},
             inputs={"spec.toml": resolved, "pictures.json": canonical_json(made.pictures)},
             differs="one with another run, spec, occlusion model, perceptual loss or other pictures",
             design=design,
@@ -203,6 +198,7 @@ def prepared(
     settings = {
         "run": spec.name,
         "spec_sha256": spec_digest(spec),
+        "height_sha256": _height_digest(design),
         "occlusion": model,
         "obstruction": getattr(kind, "name", type(kind).__name__),
         "obstruction_parameters": plain_parameters(kind),

@@ -13,6 +13,7 @@ from doedesign.capture.from_spec import (
     occlusion_from_spec,
     outside_from_kind,
     plain_parameters,
+    require_options,
     rgb_from_channels,
     sensor_from_spec,
 )
@@ -135,7 +136,7 @@ def test_options_of_a_mixed_kind_name_the_part_that_they_are_for():
     assert made.dirt == Dirt(depth_m=(0.05, 0.12), clump_m=(6e-3, 12e-3))
     assert (made.fence.depth_m, made.raindrop.depth_m, made.dirt_share) == ((0.3, 0.3), (0.05, 0.12), 0.2)
     assert depth_range_m(made) == (0.05, 0.3)
-    for options, words in (("dirt_clumps=1", "options of dirt.*clump"), ("dirt_share=2", "dirt_share")):
+    for options, words in (("dirt_clumps=1", "`dirt_clumps`.*dirt_clump`"), ("dirt_share=2", "dirt_share")):
         with pytest.raises(InputError, match=words):
             obstruction_from_spec(
                 spec_of("obstruction.kind=dirt_raindrop_fence", f"obstruction.options={{{options}}}"), "a.toml"
@@ -185,9 +186,25 @@ def test_options_that_make_no_sense(options: str, words: list[str]):
         assert word in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("{dirt_clump='3 km'}", "obstruction.options.dirt_clump: must be two numbers"),
+        ("{dirt_clump='3 s'}", "obstruction.options.dirt_clump: must be a number with a unit"),
+        ("{dirt_clumps='3 mm'}", "`dirt_clumps`. Did you mean `dirt_clump`?"),
+    ],
+)
+def test_options_of_a_part_that_make_no_sense_are_named_as_they_are_written(options: str, words: str):
+    with pytest.raises(InputError) as caught:
+        obstruction_from_spec(spec_of("obstruction.kind=dirt_raindrop", f"obstruction.options={options}"), "a.toml")
+    assert words in str(caught.value)
+
+
 def test_options_that_make_no_sense_are_told_before_a_design_is_optimised():
     with pytest.raises(InputError, match=r"obstruction\.options\.clump: must be two numbers"):
         optimize(spec_of('obstruction.options={clump="3 km"}'))
+    # A design depends on no masks, which may be elsewhere.
+    require_options(spec_of("obstruction.kind=folder", 'obstruction.options={folder="elsewhere"}'), "a.toml")
 
 
 def test_a_folder_of_masks(tmp_path: Path):

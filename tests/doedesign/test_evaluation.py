@@ -24,16 +24,20 @@ from doedesign.evaluation.methods import METHODS, MethodInputs, as_seen
 from doedesign.evaluation.pairs import PairSet
 from doedesign.evaluation.plates import PlateBanks, plates_of
 from doedesign.evaluation.published import TABLE_1, TABLE_2, published_scores
-from doedesign.evaluation.rows import FLAT, TRAININGS, MethodRow, rows_of, trainings_of
+from doedesign.evaluation.rivals.files import rival_named
+from doedesign.evaluation.rivals.training import rival_options
+from doedesign.evaluation.rows import FLAT, ROBUST, TRAININGS, MethodRow, rows_of, trainings_of
 from doedesign.evaluation.statistics import BootstrapInterval, bootstrap_mean
 from doedesign.evaluation.tables import LATER, REGIONS, SCORES, EvaluationTable, TableRow
-from doedesign.evaluation.trainings import TrainingPlan, claim_trainings, train_missing
+from doedesign.evaluation.trainings import TrainingPlan, require_asked, train_missing
 from doedesign.recon.weights import NETWORK_NAME
 from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_spec
 from doedesign.spec.values.table import SpecTable
+from doedesign.training.train import prepared
 from fab.errors import InputError
+from fab.files import MANIFEST_NAME, canonical_json
 from sim.light import linear_from_srgb, srgb_from_linear
 from sim.optic import HeightOptic
 from sim.psf_bank import PsfBank, psf
@@ -606,32 +610,62 @@ def test_another_question_needs_another_folder(run: Path, tmp_path: Path):
         evaluate(run, tmp_path / "out", pairs=1, seed=1, workers=0)
 
 
-def test_networks_of_a_table_have_one_spec_plate_and_set_of_pictures(run: Path, tmp_path: Path):
-    """They are found by their names; those of something else are refused, and what no network was made with is not."""
+def finished_training(plan: TrainingPlan, name: str) -> Path:
+    """The folder of a training as it would be left, without its network."""
+    one = TRAININGS[name]
+    options = {} if one.rival is None else rival_options(rival_named(one.rival))
+    own = plan.occlusion, plan.obstruction, plan.lpips_weights, plan.licence
+    made = prepared(plan.design(one, 0), plan.images, plan.validation, *own, options)
+    folder = plan.folder(one, 0)
+    folder.mkdir(parents=True)
+    (folder / NETWORK_NAME).touch()
+    (folder / MANIFEST_NAME).write_bytes(canonical_json({**made.settings, "state": "done"}))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["proposed", "fourier_inpainting", ROBUST])
+def test_a_network_that_was_trained_otherwise_is_refused(run: Path, tmp_path: Path, name: str):
+    """Networks are found by their names, which say nothing of spec, plate, obstruction and pictures."""
     (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "cat.png").write_bytes(sample_files()[0].read_bytes())
-    plan = TrainingPlan(run, tmp_path, "paper", "dirt", images=tmp_path / "images")
-    design = open_design(run, False)
-    other = open_design(run, False, overrides=["train.steps=7"], free=TRAINING_TABLES)
-    claim_trainings(plan, other, add=False)
-    assert not (tmp_path / "trained").exists()
-    claim_trainings(plan, other, add=True)
-    claim_trainings(plan, design, add=True)  # nothing was trained yet
-    (tmp_path / "trained" / "paper").mkdir()
-    claim_trainings(plan, design, add=True)
-    with pytest.raises(InputError, match="those with other spec"):
-        evaluate(run, tmp_path, pairs=1, overrides=["train.steps=7"], workers=0)
-    thicker = open_design(run, False, overrides=["obstruction.options={coverage=0.2}"], free=TRAINING_TABLES)
-    with pytest.raises(InputError, match="those with other spec, dirt"):
-        claim_trainings(plan, thicker, add=False)
-    claim_trainings(replace(plan, robust=run), design, add=True)
-    again = finished_run(tmp_path, SPEC.replace('"ring"', '"flat"'))
-    with pytest.raises(InputError, match="those with other robust level map"):
-        claim_trainings(replace(plan, robust=again), design, add=True)
-    (tmp_path / "images" / "dog.png").write_bytes(sample_files()[1].read_bytes())
-    claim_trainings(plan, design, add=False)  # none is added
-    with pytest.raises(InputError, match="those with other pictures"):
-        claim_trainings(plan, design, add=True)
+    for file in sample_files()[:4]:
+        (tmp_path / "images" / file.name).write_bytes(file.read_bytes())
+    plan = TrainingPlan(run, tmp_path, "paper", "dirt", images=tmp_path / "images", robust=run)
+
+    def asked(plan: TrainingPlan, pictures: bool = False) -> None:
+        require_asked(plan, [TRAININGS[name]], (0,), pictures=pictures, loss=False)
+
+    asked(plan)  # nothing is there
+    finished_training(plan, name)
+    asked(plan, pictures=True)
+    with pytest.raises(InputError, match="differs in its spec"):
+        asked(replace(plan, overrides=("train.steps=7",)))
+    # Some options are those of a spec; an obstruction of another kind has a folder of its own.
+    with pytest.raises(InputError, match="in its spec, obstruction"):
+        asked(replace(plan, overrides=("obstruction.options={coverage=0.2}",)))
+    if name == ROBUST:
+        other = finished_run(tmp_path, SPEC.replace('"ring"', '"flat"'))
+        with pytest.raises(InputError, match="in its spec, plate"):
+            asked(replace(plan, robust=other))
+    (tmp_path / "images" / sample_files()[4].name).write_bytes(sample_files()[4].read_bytes())
+    asked(plan)  # none are given
+    with pytest.raises(InputError, match="in its pictures"):
+        asked(plan, pictures=True)
+
+
+def test_a_training_of_the_run_itself_stands_for_the_proposed_one_whatever_it_was_made_of(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    """It says so."""
+    shutil.copytree(run, tmp_path / "run")
+    plan = TrainingPlan(tmp_path / "run", tmp_path / "out", "paper", "dirt")
+    shutil.copytree(finished_training(plan, "proposed"), tmp_path / "run" / "trained")
+    monkeypatch.setattr(TrainingPlan, "_is_same", lambda _, folder, __: (folder / NETWORK_NAME).is_file())
+    require_asked(plan, [TRAININGS["proposed"]], (0,), pictures=False, loss=False)
+    assert not caplog.messages
+    changed = json.loads((tmp_path / "run" / "trained" / MANIFEST_NAME).read_text()) | {"spec_sha256": "0"}
+    (tmp_path / "run" / "trained" / MANIFEST_NAME).write_bytes(canonical_json(changed))
+    require_asked(plan, [TRAININGS["proposed"]], (0,), pictures=False, loss=False)
+    assert "stands for proposed; what is asked for differs from it in its spec" in caplog.text
 
 
 @pytest.mark.study

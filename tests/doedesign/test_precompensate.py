@@ -260,16 +260,16 @@ def test_what_cannot_be_undone_is_said(run: Path, tmp_path: Path, caplog: pytest
 
 
 def test_the_wafer_is_that_of_the_run(tmp_path: Path):
-    """A process for another size of wafer takes the run's, or is refused where the place of the DOE on it matters."""
+    """A process for another size of wafer takes the run's, or is refused where depths differ over it."""
     run = finished_run(tmp_path, WITHOUT_OBJECTIVE + '[wafer]\ndiameter = "150 mm"\n')
     smaller = ESTIMATE.replace("[process]", '[process]\nwafer_radius = "50 mm"')
     (tmp_path / "estimate.toml").write_text(smaller)
-    (tmp_path / "aside.toml").write_text(smaller.replace("levels = 4", 'levels = 4\ndie = ["0 mm", "30 mm"]'))
+    (tmp_path / "bowl.toml").write_text(smaller + "radial_nonuniformity = 0.02\n")
     precompensate(run, tmp_path / "new", process=tmp_path / "estimate.toml", evaluations=0)
     spec = open_run(tmp_path / "new").spec
     assert (spec.process.wafer_radius_m, spec.wafer.diameter_m) == (0.075, 0.15)
-    with pytest.raises(InputError, match="must be for the wafer of the run, of radius 75 mm, but got 50 mm"):
-        precompensate(run, tmp_path / "other", process=tmp_path / "aside.toml", evaluations=0)
+    with pytest.raises(InputError, match="must be for the wafer of the run, of radius 75 mm, where"):
+        precompensate(run, tmp_path / "other", process=tmp_path / "bowl.toml", evaluations=0)
 
 
 @pytest.mark.parametrize(

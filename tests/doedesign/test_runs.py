@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from doedesign.overview.listing import list_results
 from doedesign.runs.folder import (
     CHECKPOINT,
     Run,
@@ -104,7 +105,7 @@ def test_another_spec_overwrites_on_request_alone(done: Run, spec: Spec, tmp_pat
         assert (run.folder / "psf" / "manifest.json").is_file()
     with claim_run(done.folder, changed, {}, overwrite=True) as run:
         assert not run.done
-        assert [path.name for path in run.folder.iterdir()] == [".doedesign-replaced"]
+        assert [path.name for path in run.folder.iterdir()] == [".doedesign-aside"]
     assert (tmp_path / "kept.txt").read_text() == "mine"
 
 
@@ -198,6 +199,57 @@ def test_a_run_comes_back_where_nothing_takes_its_place(done: Run, spec: Spec):
     with claim_run(done.folder, changed, {}, overwrite=True) as run:
         begin_run(run)
         assert {path.name for path in done.folder.iterdir()} == {"manifest.json", "spec.toml"}
+
+
+@pytest.mark.parametrize("written", range(3))
+def test_a_run_comes_back_where_the_disk_is_full_when_the_other_begins(
+    done: Run, spec: Spec, written: int, monkeypatch: pytest.MonkeyPatch
+):
+    """After so many of the other's first files; what removes the run that waits is the last thing that begins it."""
+    changed, left = spec.model_copy(update={"name": "another"}), written
+    before = {path.name: path.read_bytes() for path in done.folder.iterdir()}
+
+    def full(path: Path, content: bytes) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise InputError(str(path), "there must be room on the disk", "No space left on device", "Make room.")
+        write_atomic(path, content)
+
+    def overwritten() -> None:
+        with claim_run(done.folder, changed, {}, overwrite=True) as run:
+            begin_run(run)
+            assert written == 2
+
+    with monkeypatch.context() as patch:
+        patch.setattr("doedesign.runs.folder.write_atomic", full)
+        if written < 2:
+            with pytest.raises(InputError, match="No space"):
+                overwritten()
+        else:
+            overwritten()
+    with claim_run(done.folder, changed if written == 2 else spec, {}) as run:
+        assert run.done == (written < 2)
+    if written < 2:
+        assert {path.name: path.read_bytes() for path in done.folder.iterdir()} == before
+
+
+def test_a_run_that_waits_is_told_as_such(done: Run, spec: Spec, monkeypatch: pytest.MonkeyPatch):
+    """Where a kill left it."""
+    changed = spec.model_copy(update={"name": "another"})
+
+    def overwritten() -> None:
+        with claim_run(done.folder, changed, {}, overwrite=True):
+            monkeypatch.setattr("doedesign.runs.folder._restore", lambda _: None)
+            raise Killed
+
+    with pytest.raises(Killed):
+        overwritten()
+    (entry,) = list_results([done.folder.parent])
+    assert (entry.path, entry.state) == (done.folder, "stopped")
+    assert "brings it back" in entry.about
+    with pytest.raises(InputError, match=r"A run waits in \.doedesign-aside"):
+        open_run(done.folder)
 
 
 @pytest.mark.parametrize("moves", range(4))

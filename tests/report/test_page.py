@@ -407,9 +407,14 @@ def test_commands_to_repeat_a_run_have_their_options(run: Path):
     table = {"table": 2, "pairs": 3, "rows": [], "study": {"obstruction": "dirt", "occlusion": "paper", "seed": 4}}
     (run / "evaluation" / "table2-dirt-paper" / "table.json").write_bytes(canonical_json(table))
     (run / "trained").mkdir()
-    (run / "trained" / MANIFEST_NAME).write_bytes(canonical_json({"occlusion": "paper", "obstruction": "dirt"}))
+    trained = {
+        "occlusion": "paper",
+        "obstruction": "dirt",
+        "overrides": ["train.steps=3"],
+        "perceptual": "lpips_squeeze",
+    }
+    (run / "trained" / MANIFEST_NAME).write_bytes(canonical_json(trained))
     (run / "trained" / "pictures.json").write_bytes(canonical_json({"training": ["mine.png"]}))
-    (run / "trained" / "spec.toml").write_text('# --set train.steps=3\nname = "small"\n')
     assert repeated(run) == [
         "doedesign optimize spec.toml --out runs/small",
         "doedesign psf runs/small",
@@ -417,7 +422,8 @@ def test_commands_to_repeat_a_run_have_their_options(run: Path):
         "doedesign tolerance runs/small --draws 8 --seed 0 --sensitivity sobol --sobol 32 --corners --budget overlay_x "
         "--yield 0.8 --limit 'strehl >= 0.9'",
         "doedesign simulate runs/small",
-        "doedesign train runs/small --occlusion paper --obstruction dirt --images PICTURES --set train.steps=3",
+        "doedesign train runs/small --occlusion paper --obstruction dirt --images PICTURES --lpips-weights WEIGHTS "
+        "--set train.steps=3",
         "doedesign evaluate runs/small --table 2 --obstruction dirt --occlusion paper --seed 4 --pairs 3",
         "doedesign calibrate runs/small --ring-to-disc 1.2 --probe '520 nm' --depth '100 mm' --throughput 0.86 "
         "--throughput-sigma 0.02 --reach 4",
@@ -425,7 +431,7 @@ def test_commands_to_repeat_a_run_have_their_options(run: Path):
     ]
     masks = {"obstruction": "folder", "obstruction_parameters": {"folder": "my masks"}}
     (run / "trained" / MANIFEST_NAME).write_bytes(canonical_json(masks))
-    assert "doedesign train runs/small --obstruction 'my masks' --images PICTURES --set train.steps=3" in repeated(run)
+    assert "doedesign train runs/small --obstruction 'my masks' --images PICTURES" in repeated(run)
     with results_folder(run / "fabricated", "small", run, plate="errors of my plate.toml"):
         pass
     assert "doedesign psf runs/small --fabricated --variation 'my plate.toml'" in repeated(run)

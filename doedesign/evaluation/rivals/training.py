@@ -105,12 +105,9 @@ def train_rival(
     chosen = rival_named(rival) if isinstance(rival, str) else rival
     if not (np.isfinite(adversarial) and adversarial >= 0):
         raise InputError("adversarial", "must be a weight of 0 or more", adversarial, "Correct it, or leave it out.")
-    camera = "doe" if chosen.given == "doe capture" else "conventional"
-    fixed = {"freeze": "optics", "field": "off", "fabricated": False, "precision": "float32", "camera": camera}
+    how_given = {**options, **rival_options(chosen)}
     with stoppable():  # which ends the preparation, too
-        made = prepared(
-            design, images, validation, occlusion, obstruction, lpips_weights, licence, {**options, **fixed}
-        )
+        made = prepared(design, images, validation, occlusion, obstruction, lpips_weights, licence, how_given)
         spec, how = made.spec, made.spec.train
         if chosen.judge is None:
             adversarial = 0.0
@@ -130,7 +127,7 @@ def train_rival(
             title=f"{chosen.name}, {spec.name}",
             options=how,
             settings=settings,
-            remarks={"licence": licence},
+            remarks={"licence": licence, "overrides": list(overrides)},
             inputs={
                 "spec.toml": spec_to_resolved_toml(spec, overrides).encode(),
                 "pictures.json": canonical_json(made.pictures),
@@ -149,6 +146,12 @@ def train_rival(
         )
     found = trained(job, out, open_rival)
     return detached(found) if out is None else found
+
+
+def rival_options(rival: Rival) -> dict[str, Any]:
+    """How a rival is trained, whatever a spec says of the project's own network."""
+    camera = "doe" if rival.given == "doe capture" else "conventional"
+    return {"freeze": "optics", "field": "off", "fabricated": False, "precision": "float32", "camera": camera}
 
 
 def _facts(rival: Rival, network: RivalNetwork) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from doedesign import __version__
 from doedesign.capture.images import sample_files
 from doedesign.report.page.blocks import CommandBlock, PageBlock, PageSection, TableBlock, TextBlock, section
 from doedesign.report.page.files import RunFiles, listed_bytes, listed_json
-from doedesign.spec import overrides_told
+from doedesign.spec import spec_digest
 from fab.files import MANIFEST_NAME, read_bytes, read_json
 from fab.units import format_length
 from sim.store import read_stored_bank
@@ -136,7 +136,7 @@ def _of_simulated(files: RunFiles) -> Options:
 
 
 def _of_trained(files: RunFiles) -> Options:
-    """Where it is not that of the spec; the folder of the pictures is not known."""
+    """What is not that of the spec; the folder of the pictures and the files of LPIPS are not known."""
     folder = files.folder / "trained"
     record, own = _manifest_of(folder), files.spec
     usual = {"occlusion": own.scene.occlusion, "obstruction": own.obstruction.kind if own.obstruction else None}
@@ -146,19 +146,23 @@ def _of_trained(files: RunFiles) -> Options:
     pictures = read_json(folder / "pictures.json") if (folder / "pictures.json").is_file() else {}
     if not {*pictures.get("training", ())} <= {path.name for path in sample_files()}:
         found.append(("images", "PICTURES"))
-    spec = folder / "spec.toml"
-    text = read_bytes(spec).decode(errors="replace") if spec.is_file() else ""
-    return *found, *(("set", shlex.quote(one)) for one in overrides_told(text))
+    if str(record.get("perceptual")).startswith("lpips"):
+        found.append(("lpips-weights", "WEIGHTS"))
+    overrides = record.get("overrides")
+    return *found, *(("set", shlex.quote(str(one))) for one in (overrides if isinstance(overrides, list) else ()))
 
 
 def _of_evaluation(files: RunFiles) -> tuple[Options, ...]:
-    """Every table and figure; rows that are left out, folders of pictures and trainings are not known."""
-    home, found = files.folder / "evaluation", []
+    """Every table and figure; which rows, pictures and changes of the spec are not known."""
+    home, found, own = files.folder / "evaluation", [], spec_digest(files.spec)
     for path in sorted(home.glob("table*/table.json")):
         table = read_json(path)
         study = _mapping(table.get("study"))
         asked = [(key, shlex.quote(str(study[key]))) for key in ("obstruction", "occlusion", "seed") if key in study]
         asked += [("reflect", "")] if study.get("border") == "reflect" else []
+        asked += [("lpips-weights", "WEIGHTS")] if str(study.get("perceptual")).startswith("lpips") else []
+        if study.get("spec_sha256", own) != own:
+            asked.append(("set", "CHANGES"))
         found.append((("table", str(table.get("table"))), *asked, ("pairs", str(table.get("pairs")))))
     for name, figure in {"figure4": "4", "figure8": "8", "bench": "bench"}.items():
         if (home / name).is_dir():
