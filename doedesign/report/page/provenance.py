@@ -136,7 +136,7 @@ def _of_simulated(files: RunFiles) -> Options:
 
 
 def _of_trained(files: RunFiles) -> Options:
-    """What is not that of the spec; the folder of the pictures and the files of LPIPS are not known."""
+    """Options where it differs from the spec; the folder of the pictures and the files of LPIPS are not known."""
     folder = files.folder / "trained"
     record, own = _manifest_of(folder), files.spec
     usual = {"occlusion": own.scene.occlusion, "obstruction": own.obstruction.kind if own.obstruction else None}
