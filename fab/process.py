@@ -21,6 +21,7 @@ from fab.deviations import (
     variation_of,
 )
 from fab.errors import InputError
+from fab.files import IF_ANY
 from fab.levels import Levels
 from fab.units import MM, UM
 
@@ -115,7 +116,7 @@ class Process:
     minimum_space_m: float = 0.0
     die_m: tuple[float, float] = (0.0, 0.0)
     wafer_radius_m: float = 50 * MM
-    reduction: int = 1
+    reduction: int = field(default=1, metadata=IF_ANY)
     name: str = "ideal"
 
     def __post_init__(self) -> None:

@@ -142,6 +142,8 @@ def simulate_files(
     }
     if plate is not None:
         settings["variation"] = variation_to_toml(plate.errors)
+        # Where the DOE lies on its wafer, for one.
+        settings["process"] = asdict(plate.process)
     size_words = f"{view.shape[1]} x {view.shape[0]} pixels"
     _log.info("%d items of %s, %s, %s; %s", count, size_words, settings["obstruction"], model.occlusion, words)
 

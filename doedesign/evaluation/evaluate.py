@@ -134,6 +134,7 @@ def evaluate(
         lpips = read_lpips(lpips_weights) if lpips_weights else None
         how: Any = {"occlusion": occlusion, "obstruction": obstruction, "seed": seed, "border": border}
         asked = PairSet.of(design.spec, str(run / "spec.toml"), picture_files(given.test), **how)
+        _require_names_apart(asked.files, given.test)
         own = design.spec.obstruction
         kind = obstruction or (own.kind if own else "")  # without either no pairs are made
         _require_names(programs, rows_of(table, kind, robust=robust is not None))
@@ -231,6 +232,16 @@ def _sources(folder: Path, images: str | Path | None, test: str | Path | None, l
             if path.suffix.lower() in PICTURE_FILES and not (home / path.name).is_file():
                 write_atomic(home / path.name, read_bytes(path))
     return Sources(homes[0], homes[1] if test is None else Path(test), licence)
+
+
+def _require_names_apart(files: Sequence[Path], test: Path) -> None:
+    """Refuse pictures of one name, as in folders of several films: a photograph is known by its name."""
+    known: dict[str, Path] = {}
+    for path in files:
+        if (other := known.setdefault(path.name, path)) != path:
+            got = f"{path.relative_to(test)} and {other.relative_to(test)}"
+            rule, cure = "pictures to judge by must have names of their own", "Rename them, film by film for example."
+            raise InputError(str(test), rule, got, cure)
 
 
 def _require_apart(images: Path, test: Path) -> None:

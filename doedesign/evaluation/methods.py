@@ -86,7 +86,9 @@ def wiener(given: MethodInputs, *, near: bool = False) -> Picture:
 
     def by_colour(image: np.ndarray, psf: np.ndarray, ratio: float) -> np.ndarray:
         y, x = image.shape
-        period = np.pad(image, ((0, y), (0, x)), mode="symmetric")
+        # Mirrored once, or as often as a wide PSF needs.
+        more = [2 * size * max(1, -(-wide // (2 * size))) - size for size, wide in zip((y, x), psf.shape, strict=True)]
+        period = np.pad(image, [(0, count) for count in more], mode="symmetric")
         return np.asarray(restored(period, psf, balance=ratio, clip=False))[:y, :x]
 
     return _deconvolved(given, near, by_colour)

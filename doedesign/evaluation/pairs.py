@@ -1,9 +1,10 @@
 """Test pairs: an obstruction before a picture, fixed by a seed, at depths where PSFs are computed exactly.
 
 Pair i is a function of the seed and i alone: picture, crop, obstruction and both depths. Near depths are some that lie
-evenly in 1/z within the range of the obstruction, far ones the ends of the scene's range, so that a plate's PSFs are
-computed once for all pairs and nothing is interpolated. Scenes bring their surroundings along, so that light comes in
-over the edges of a capture as it does in the world; with `border="reflect"` they are mirrored there, as in training.
+evenly in 1/z within the range of the obstruction, or of that which it is of several; far ones are the ends of the
+scene's range. So a plate's PSFs are computed once for all pairs, and nothing is interpolated. Scenes bring their
+surroundings along, so that light comes in over the edges of a capture as it does in the world; with `border="reflect"`
+they are mirrored there, as in training.
 """
 
 from collections.abc import Sequence
@@ -30,7 +31,7 @@ from sim.obstruction import CameraView, ObstructionKind
 from sim.psf_bank import PsfBank
 
 NEAR_DEPTHS = 8
-_SALT_DEPTHS = 5
+_SALT_DEPTHS, _SALT_PARTS = 5, 6
 
 
 class PairDepths(NamedTuple):
@@ -38,6 +39,19 @@ class PairDepths(NamedTuple):
 
     far_m: float
     near_m: float
+
+
+def parts_of(kind: ObstructionKind) -> tuple[tuple[float, ObstructionKind], ...]:
+    """What a kind of obstruction is by lot, and how often; itself always where it is one alone."""
+    return getattr(kind, "parts", ((1.0, kind),))
+
+
+def _even_depths_m(kind: ObstructionKind) -> tuple[float, ...]:
+    """Distances at which pairs have a kind of obstruction, even in 1/z."""
+    least, most = depth_range_m(kind)
+    if least == most:
+        return (least,)
+    return tuple(float(depth) for depth in 1 / np.linspace(1 / most, 1 / least, NEAR_DEPTHS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +106,13 @@ class PairSet:
         camera = replace(camera_from_spec(spec), window=spec.sensor.window | 1)
         name = occlusion_from_spec(spec, source, occlusion)
         model = replace(CaptureModel.make(camera, kind, name, sensor_from_spec(spec)), border=border)
-        least, most = depth_range_m(kind)
-        near = 1 / np.linspace(1 / most, 1 / least, NEAR_DEPTHS) if least < most else np.array([least])
+        near = tuple(dict.fromkeys(depth for _, part in parts_of(kind) for depth in _even_depths_m(part)))
         far = tuple(dict.fromkeys((min(spec.scene.far_m), max(spec.scene.far_m))))
         if max(near) >= min(far):
             rule, got = "obstructions must lie before the scene", f"{max(near):g} m and {min(far):g} m"
             raise InputError(f"{source}: scene", rule, got, "Change scene.near or scene.far.")
         size = training_size(spec)
-        return cls(tuple(files), kind, model, size, tuple(float(z) for z in near), far, seed)
+        return cls(tuple(files), kind, model, size, near, far, seed)
 
     @property
     def depths_m(self) -> tuple[float, ...]:
@@ -109,7 +122,17 @@ class PairSet:
     def depths(self, number: int) -> PairDepths:
         """Distances of a pair."""
         rng = np.random.default_rng((self.seed, _SALT_DEPTHS, number))
-        return PairDepths(float(rng.choice(self.far_m)), float(rng.choice(self.near_m)))
+        far_m = float(rng.choice(self.far_m))
+        return PairDepths(far_m, float(rng.choice(_even_depths_m(self._part(number)))))
+
+    def _part(self, number: int) -> ObstructionKind:
+        """The obstruction of a pair: one of several by lot."""
+        parts = parts_of(self.kind)
+        if len(parts) == 1:
+            return self.kind
+        shares = np.array([share for share, _ in parts])
+        rng = np.random.default_rng((self.seed, _SALT_PARTS, number))
+        return parts[rng.choice(len(parts), p=shares / shares.sum())][1]
 
     def scene(self, number: int) -> NamedScene:
         """The scene of a pair, with its surroundings, in red, green and blue.
@@ -117,20 +140,18 @@ class PairSet:
         Raises:
             InputError: no picture is whole, or the obstruction cannot be drawn.
         """
-        return self._sources[self.depths(number)].item(number)
+        far, near = self.depths(number)
+        kind = at_depth(self._part(number), (near, near))
+        return SceneData(self._pictures, kind, self._view, (far, far), self.seed, mirrored=False).item(number)
 
     @cached_property
-    def _sources(self) -> dict[PairDepths, SceneData]:
+    def _pictures(self) -> Pictures:
+        return Pictures(self.files, most_px=2 * (self.size + self.model.margin_px))
+
+    @property
+    def _view(self) -> CameraView:
         side = self.size + self.model.margin_px
-        pictures = Pictures(self.files, most_px=2 * side)
-        view = CameraView((side, side), self.model.camera.pixel_m, self.model.camera.sensor_distance_m)
-        return {
-            PairDepths(far, near): SceneData(
-                pictures, at_depth(self.kind, (near, near)), view, (far, far), self.seed, mirrored=False
-            )
-            for far in self.far_m
-            for near in self.near_m
-        }
+        return CameraView((side, side), self.model.camera.pixel_m, self.model.camera.sensor_distance_m)
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields alone: pictures that are in memory stay here."""

@@ -85,4 +85,5 @@ def published_scores(table: int, obstruction: str) -> Mapping[str, PublishedScor
     """
     if table == 1:
         return TABLE_1
-    return next((rows for kind, rows in TABLE_2.items() if kind in Path(obstruction).name), {})
+    named = [rows for kind, rows in TABLE_2.items() if kind in Path(obstruction).name]
+    return named[0] if len(named) == 1 else {}

@@ -4,6 +4,7 @@ A pair is drawn once; every camera photographs it once; every row makes its pict
 `doedesign.training.scores`.
 """
 
+import threading
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -97,7 +98,7 @@ class PairWork:
 
     def _kept(self, number: int, name: str, make: Any) -> Any:
         """A result of this pair, made once; of another pair nothing is kept."""
-        memory = self._memory
+        memory = self._memory.__dict__
         if memory.get("number") != number:
             memory.clear()
             memory |= {"number": number, "scene": self.pairs.scene(number)}
@@ -106,8 +107,9 @@ class PairWork:
         return memory[name]
 
     @cached_property
-    def _memory(self) -> dict[str, Any]:
-        return {}
+    def _memory(self) -> threading.local:
+        """One for every thread, for a worker may evaluate several pairs at once."""
+        return threading.local()
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields alone: what was made of a pair stays here."""

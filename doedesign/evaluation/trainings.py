@@ -15,7 +15,7 @@ import threading
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -94,7 +94,16 @@ class TrainingPlan:
         else:
             source = self.robust if training.name == ROBUST else self.run
         assert source is not None  # rows of a robust design come with one
-        return open_design(source, False, overrides=self.changes(training, seed), free=TRAINING_TABLES)
+        found = open_design(source, False, overrides=self.changes(training, seed), free=TRAINING_TABLES)
+        return self._as_the_others(found, training, seed) if training.name == ROBUST else found
+
+    def _as_the_others(self, robust: Design, training: Training, seed: int) -> Design:
+        """A robust design with scenes, sensor and training of the run, for both are rows of one table."""
+        own = open_design(self.run, False, overrides=self.changes(training, seed), free=TRAINING_TABLES).spec
+        assert own is not None  # every run has one
+        assert robust.spec is not None
+        tables = {name: getattr(own, name) for name in TRAINING_TABLES}
+        return replace(robust, spec=robust.spec.model_copy(update=tables))
 
     def design_after(self, training: Training, seed: int) -> Design:
         """The design that a training leaves; it must be finished, unless it keeps its plate."""

@@ -42,7 +42,16 @@ from doedesign.training.pairs import PairData
 from doedesign.training.validation import EvaluationResult
 from fab.errors import InputError
 from fab.figure import save
-from fab.files import MANIFEST_NAME, canonical_json, read_json, scratch_folder, sha256_bytes, sha256_file, write_atomic
+from fab.files import (
+    MANIFEST_NAME,
+    canonical_json,
+    clear_killed,
+    read_json,
+    scratch_folder,
+    sha256_bytes,
+    sha256_file,
+    write_atomic,
+)
 
 _Opened = TypeVar("_Opened")
 
@@ -165,8 +174,6 @@ def _run(job: TrainingJob, folder: Path, stop: StopRequest, tensorboard: bool) -
 
 def _is_done(folder: Path, job: TrainingJob, digest: str) -> bool:
     """Whether a training is finished; refuse the folder of another, and clear away leftovers of a killed one."""
-    for path in (folder / "validation").glob(".*"):
-        path.unlink()
     path = folder / MANIFEST_NAME
     if not path.is_file():
         if folder.is_dir() and any(not each.name.startswith(".") for each in folder.iterdir()):
@@ -180,6 +187,8 @@ def _is_done(folder: Path, job: TrainingJob, digest: str) -> bool:
     if found.get("format") != own or found.get("settings_sha256") != digest:
         rule, cure = f"the folder must belong to this {job.name}", "Choose another output folder, or remove that one."
         raise InputError(str(folder), rule, job.differs, cure)
+    if (folder / "validation").is_dir():
+        clear_killed(folder / "validation", lambda name: name.endswith(".png"))
     if found["state"] != "done":
         return False
     for name, expected in found["results_sha256"].items():

@@ -272,15 +272,15 @@ class JointTraining(TrainingJob):
     def initial(self) -> JointState:
         """The state before the first step.
 
-        It has the heights of the design before rounding, those of its levels where they are not at hand, and of rings
-        their profile.
+        It has the heights of the design before rounding, those of its levels where they are not at hand or stay as they
+        are, and of rings their profile.
         """
         doe, heights = self.trainer.doe, self.design.continuous_m
         learnt = None if doe.parametrization is None else doe.learnt
         if self.options.camera == "conventional":
             shape = self.trainer.bench.camera.grid.shape if learnt is None else learnt.shape
             return self.trainer.initial(np.zeros(shape, np.float32))
-        if heights is None:
+        if heights is None or not self.options.moves_optics:
             heights = self.design.nominal_height_m
         if learnt is not None:
             heights = learnt.heights_of(heights)
@@ -329,7 +329,7 @@ class JointTraining(TrainingJob):
     def write_results(self, folder: Path, state: JointState) -> list[str]:
         """Write network, DOE, PSFs and scores."""
         spec, camera = self.trainer.spec, self.trainer.bench.camera
-        near = spec.scene.near_m or depth_range_m(self.kind)
+        near = trained_near_m(spec, self.kind)
         names = [NETWORK_NAME, BANK_NAME, "metrics.json"]
         height = np.zeros(camera.grid.shape, np.float32)
         if spec.train.camera == "doe":
@@ -377,6 +377,18 @@ def _shown(trainer: Trainer, state: JointState, batch: Batch, baselines: bool) -
         }
     display = {name: srgb_from_linear(image) for name, image in found.items()}
     return {**display, "reconstruction": np.asarray(picture, np.float32)[0]}
+
+
+def trained_near_m(spec: Spec, kind: ObstructionKind) -> tuple[float, ...]:
+    """Depths of obstructions that a network is trained on, metres: those of a spec at which its kind is drawn.
+
+    Args:
+        spec: the spec.
+        kind: the obstruction, whose own depth comes before the spec's near ones.
+    """
+    least, most = depth_range_m(kind)
+    within = tuple(depth for depth in spec.scene.near_m if least <= depth <= most)
+    return within or (least, most)
 
 
 def _height_digest(design: Design) -> str:

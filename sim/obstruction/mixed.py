@@ -11,7 +11,7 @@ from fab.errors import InputError
 from sim.imaging.scene import Obstruction
 from sim.obstruction.dirt import Dirt
 from sim.obstruction.fence import Fence
-from sim.obstruction.parameters import Range, WithLimits
+from sim.obstruction.parameters import ObstructionKind, Range, WithLimits
 from sim.obstruction.raindrop import Raindrop
 from sim.obstruction.view import CameraView
 
@@ -43,6 +43,12 @@ class DirtRaindropFence(WithLimits):
         if self.dirt_share + self.raindrop_share > 1:
             rule, got = "shares must add up to at most 1", f"{self.dirt_share:g} and {self.raindrop_share:g}"
             raise InputError(f"{self.name}: raindrop_share", rule, got, "Lower one of them; fences get the rest.")
+
+    @property
+    def parts(self) -> tuple[tuple[float, ObstructionKind], ...]:
+        """What it is, and how often."""
+        rest = max(1 - self.dirt_share - self.raindrop_share, 0.0)
+        return (self.dirt_share, self.dirt), (self.raindrop_share, self.raindrop), (rest, self.fence)
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Cast lots and draw (see `sim.obstruction.parameters.ObstructionKind`)."""

@@ -70,7 +70,7 @@ def _told(parameter: str, value: Any) -> str:
     """A value as messages say it: a length or an angle, as the ending of the parameter's name says, with its unit."""
     if isinstance(value, tuple | list) and value and all(map(is_number, value)):
         return " and ".join(_told(parameter, each) for each in value)
-    if not is_number(value):
+    if not (isinstance(value, Real) and is_number(value)):
         return repr(value)
     if parameter.endswith("_m"):
         return format_length(float(value))

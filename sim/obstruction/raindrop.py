@@ -28,7 +28,7 @@ from scipy.ndimage import map_coordinates
 
 from sim.imaging.scene import Obstruction
 from sim.obstruction.dirt import Dirt
-from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
+from sim.obstruction.parameters import DEPTHS_M, ObstructionKind, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
 Pixels = Float[np.ndarray, "n m"]
@@ -264,6 +264,11 @@ class DirtRaindrop(WithLimits):
 
     name: ClassVar[str] = "dirt_raindrop"
     limits: ClassVar[Mapping[str, Range]] = {"dirt_share": (0.0, 1.0)}
+
+    @property
+    def parts(self) -> tuple[tuple[float, ObstructionKind], ...]:
+        """What it is, and how often."""
+        return (self.dirt_share, self.dirt), (1 - self.dirt_share, self.raindrop)
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Toss the coin and draw."""

@@ -6,6 +6,9 @@ import json
 import re
 import shutil
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +30,7 @@ from doedesign.evaluation.published import TABLE_1, TABLE_2, published_scores
 from doedesign.evaluation.rivals.files import rival_named
 from doedesign.evaluation.rivals.training import rival_options
 from doedesign.evaluation.rows import FLAT, ROBUST, TRAININGS, MethodRow, rows_of, trainings_of
+from doedesign.evaluation.scoring import PairWork
 from doedesign.evaluation.statistics import BootstrapInterval, bootstrap_mean
 from doedesign.evaluation.tables import LATER, REGIONS, SCORES, EvaluationTable, TableRow
 from doedesign.evaluation.trainings import TrainingPlan, require_asked, train_missing
@@ -149,6 +153,56 @@ def test_depths_are_those_whose_psfs_are_known(pairs: PairSet):
         assert float(scene.background_depth_m) == pytest.approx(depths[number].far_m)
 
 
+def test_a_pair_of_several_obstructions_has_the_depth_of_the_one_that_it_is():
+    """Dirt and drops at 5 to 12 cm, a fence at 40 to 80 cm: none is where another lies."""
+    kind = ["obstruction.kind=dirt_raindrop_fence", 'obstruction.options={fence_depth=["40 cm", "80 cm"]}']
+    path = Path(__file__).parents[2] / "examples" / "automotive.toml"
+    spec = load_spec(path, [*kind, "sensor.window=64", "train.size=64"])
+    several = PairSet.of(spec, "a.toml", sample_files()[:3], occlusion="paper")
+    found: dict[str, list[float]] = {"dirt": [], "raindrop": [], "fence": []}
+    for number in range(60):
+        part: Any = several._part(number)
+        found[part.name].append(several.depths(number).near_m)
+    assert all(len(depths) > 8 for depths in found.values())  # a third each, of 60: 20, which strays by 4
+    assert {depth for depths in found.values() for depth in depths} <= set(several.near_m)
+    for name, (least, most) in {"dirt": (0.05, 0.12), "raindrop": (0.05, 0.12), "fence": (0.4, 0.8)}.items():
+        assert least - 1e-9 < min(found[name]) < max(found[name]) < most + 1e-9
+    assert published_scores(2, "dirt_raindrop_fence") == {}
+
+
+def test_a_worker_of_several_threads_mixes_no_pairs(pairs: PairSet):
+    """What was made of a pair is kept by thread."""
+    work, together = PairWork(pairs, {}, ()), threading.Barrier(4)
+
+    def both(number: int) -> tuple[int, int]:
+        together.wait()
+        first = work._kept(number, "first", lambda _: (time.sleep(0.01), number)[1])
+        together.wait()
+        return first, work._kept(number, "second", lambda _: number)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(both, range(8))) == [(number, number) for number in range(8)]
+
+
+def test_pictures_of_one_name_are_refused(run: Path, tmp_path: Path):
+    for film in ("one", "two"):
+        (tmp_path / "test" / film).mkdir(parents=True)
+        (tmp_path / "test" / film / "0001.png").write_bytes(sample_files()[0].read_bytes())
+    with pytest.raises(InputError, match=r"must have names of their own, but got .*0001\.png"):
+        evaluate(run, tmp_path / "out", test=tmp_path / "test", pairs=1, workers=0)
+
+
+def test_a_robust_plate_is_learnt_for_as_the_others_are(run: Path, tmp_path: Path):
+    """Whatever the spec of its own run says of scenes and of training."""
+    other = finished_run(tmp_path, SPEC.replace("steps = 2\n", "steps = 9\n").replace('"ring"', '"flat"'))
+    plan = TrainingPlan(run, tmp_path / "out", "paper", "dirt", robust=other)
+    spec, own = plan.design(TRAININGS[ROBUST], 0).spec, plan.design(TRAININGS["proposed"], 0).spec
+    assert spec is not None
+    assert own is not None
+    assert spec.train == own.train.model_copy(update={"freeze": "optics"})
+    assert (spec.network, spec.obstruction, spec.sensor) == (own.network, own.obstruction, own.sensor)
+
+
 @pytest.mark.slow
 def test_a_capture_lies_on_its_scene(pairs: PairSet):
     """Far from the obstruction a plain lens shows the scene itself, blurred by its own spot alone."""
@@ -235,6 +289,16 @@ def test_every_row_of_the_paper_has_one_of_ours():
         assert {row.paper for row in rows_of(2, obstruction) if row.paper} == set(published)
     with pytest.raises(InputError, match="must be 1 or 2"):
         rows_of(3, "dirt")
+
+
+def test_a_wide_psf_is_mirrored_over_as_often_as_it_needs(rng: np.random.Generator):
+    """One that is a point leaves the picture, whatever its window; noise is next to none."""
+    light = rng.random((3, 16, 16)).astype(np.float32)
+    psf = np.zeros((3, 41, 41), np.float32)
+    psf[:, 20, 20] = 1
+    bright = Sensor(exposure=1e9, full_well_e=1e12)
+    shown = METHODS["wiener_far"](MethodInputs(light, psf, psf, np.zeros((16, 16), np.float32), bright))
+    np.testing.assert_allclose(shown, srgb_from_linear(light), atol=1e-3)
 
 
 def test_rows_are_named_once_and_their_trainings_are_known():

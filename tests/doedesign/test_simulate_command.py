@@ -9,8 +9,12 @@ import pytest
 from PIL import Image
 
 import doedesign.capture.folder
+from doedesign.capture.folder import PlateErrors, simulate_files
 from doedesign.capture.image_files import read_image
+from doedesign.runs.level_maps import open_design
+from fab.errors import InputError
 from fab.files import read_json
+from fab.process import Process, Variation
 from tests.doedesign.small_runs import call, finished_run
 from tests.pictures import leave_out_pictures
 
@@ -206,6 +210,21 @@ def test_a_plate_as_fabricated(run: Path, images: Path, tmp_path: Path):
     found = [item_images(tmp_path / folder / drawn["items"][0]) for folder in "ab"]
     assert np.array_equal(found[0]["conventional"], found[1]["conventional"])
     assert not np.array_equal(found[0]["capture"], found[1]["capture"])
+
+
+@pytest.mark.slow
+def test_captures_of_one_process_are_none_of_another(run: Path, images: Path, tmp_path: Path):
+    """The same errors of a plate that lies elsewhere on its wafer."""
+    design, seen = open_design(run, False), set()
+    errors = Variation(radial_nonuniformity=0.05)
+    for die_m in ((0.0, 0.0), (0.03, 0.03)):
+        plate = PlateErrors(Process(design.levels, die_m=die_m), errors, "errors of a file")
+        out = tmp_path / f"{die_m[0]}"
+        simulate_files(design, out, images, occlusion="radiometric", count=1, plate=plate)
+        seen.add(read_json(out / "manifest.json")["settings_sha256"])
+    assert len(seen) == 2
+    with pytest.raises(InputError, match="must belong to"):
+        simulate_files(design, tmp_path / "0.0", images, occlusion="radiometric", count=1, plate=plate)
 
 
 def test_a_mosaic(run: Path, images: Path, tmp_path: Path):

@@ -5,6 +5,7 @@ Networks are as small as they go, for the time goes into compiling steps.
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -13,11 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from doedesign.capture.from_spec import obstruction_from_spec
 from doedesign.capture.scenes import Batch
 from doedesign.spec.training import TrainSpec
 from doedesign.training.checkpoint import read_checkpoint, write_checkpoint
 from doedesign.training.joint import JointState, Trainer, devices_mesh, rates_at, resting_depths_m
-from doedesign.training.train import _with_options
+from doedesign.training.train import JointTraining, _with_options, trained_near_m
+from doedesign.training.validation import SCENE_SEED
 from fab.errors import InputError
 from sim.light import srgb_from_linear
 from sim.obstruction import Dirt
@@ -116,6 +119,40 @@ def test_optics_alone_learn_from_their_capture() -> None:
     assert found == same
     assert found[-1] < found[0]
     assert alike(numbers(state.network), numbers(made.initial(heights()).network))
+
+
+@pytest.mark.parametrize(("freeze", "moves"), [("optics", False), ("none", True)])
+def test_a_plate_that_stays_is_the_one_that_is_drawn(freeze: Any, moves: bool) -> None:
+    """Rules and errors in the loop make levels that are not the nearest to the heights before rounding."""
+    design = replace(plate_drawn(cells=16), continuous_m=np.full((16, 16), 0.3e-6, np.float32))
+    begun: list[np.ndarray] = []
+
+    def initial(height_m: np.ndarray) -> None:
+        begun.append(height_m)
+        raise LookupError
+
+    trainer: Any = SimpleNamespace(doe=SimpleNamespace(parametrization=None), initial=initial)
+    job: Any = SimpleNamespace(design=design, trainer=trainer, options=TrainSpec(freeze=freeze, fabricated=True))
+    with pytest.raises(LookupError):
+        JointTraining.initial(job)
+    np.testing.assert_array_equal(begun[0], design.continuous_m if moves else design.nominal_height_m)
+
+
+def test_held_out_scenes_have_obstructions_of_their_own() -> None:
+    """Also where a training has the usual seed."""
+    assert SCENE_SEED > 2**32  # no seed of a training is as large, nor that of the lesson about veil and gain
+    for seed in range(3):
+        streams = [np.random.default_rng(np.random.SeedSequence(s, spawn_key=(0, 1))) for s in (seed, SCENE_SEED)]
+        assert streams[0].random() != streams[1].random()
+
+
+@pytest.mark.parametrize(
+    ("options", "depths"),
+    [("{}", (6e-3, 9e-3)), ('{depth=["7 mm", "20 mm"]}', (9e-3,)), ('{depth="30 mm"}', (0.03, 0.03))],
+)
+def test_depths_that_a_network_is_told_of_are_those_of_its_scenes(options: str, depths: tuple[float, ...]) -> None:
+    spec = small_spec(f"obstruction.options={options}", 'scene.near=["6 mm", "9 mm"]')
+    assert trained_near_m(spec, obstruction_from_spec(spec, "small.toml")) == pytest.approx(depths)
 
 
 def test_a_conventional_camera_has_a_flat_plate() -> None:

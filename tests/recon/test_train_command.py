@@ -627,9 +627,16 @@ def test_what_must_be_named_and_whole(run: Path, images: Path, tmp_path: Path):
 def test_folders_of_others_are_left_alone(run: Path, images: Path, whole: Path, tmp_path: Path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    (tmp_path / "mine" / "validation" / ".thumbs").mkdir(parents=True)
+    (tmp_path / "mine" / "validation" / ".gitkeep").touch()
     code, said = trained(run, tmp_path / "mine", images)
     assert (code, "other content" in said) == (2, True)
-    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
+    assert sorted(path.name for path in (tmp_path / "mine").rglob("*")) == [
+        ".gitkeep",
+        ".thumbs",
+        "thesis.tex",
+        "validation",
+    ]
     before = content(whole)
     for changes in (["train.seed=1"], ["scene.occlusion=radiometric"]):
         code, said = trained(run, whole, images, *changes)

@@ -30,7 +30,7 @@ from jaxtyping import Array, Key
 
 from doedesign import __version__
 from doedesign.build import camera_from_spec
-from doedesign.capture.camera import CaptureModel, depth_range_m
+from doedesign.capture.camera import CaptureModel
 from doedesign.capture.from_spec import rgb_from_channels, sensor_from_spec
 from doedesign.capture.scenes import Batch, SceneData
 from doedesign.design.design import Design
@@ -48,7 +48,7 @@ from doedesign.training.job import TrainingJob, trained
 from doedesign.training.joint import LOOK_SEED, Trainer, rates_at, scenes_seen
 from doedesign.training.loss import adam_step, history_line, losses
 from doedesign.training.optics import TrainingDoe, TrainingScene, shots
-from doedesign.training.train import Prepared, prepared
+from doedesign.training.train import Prepared, prepared, trained_near_m
 from doedesign.training.validation import EvaluationResult, HeldOutScene, judge
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_bytes, write_atomic
@@ -137,7 +137,7 @@ def train_rival(
             spec=spec,
             network=network,
             view=view,
-            near_m=tuple(spec.scene.near_m or depth_range_m(made.kind)),
+            near_m=trained_near_m(spec, made.kind),
             adversarial=adversarial,
             data=made.data,
             held_out=made.held_out,
