@@ -101,7 +101,7 @@ def _without_dark(
 ) -> tuple[Image, Image]:
     """Counts above black, and their variance without light."""
     read = (noise.read_e / noise.gain_e) ** 2 + frame.step**2 / 12
-    if isinstance(dark, float | int):
+    if not isinstance(dark, CameraFrame):
         light = frame.counts.astype(np.float64) - dark
         floor = np.full(light.shape, read)
     else:

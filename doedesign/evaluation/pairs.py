@@ -42,7 +42,7 @@ class PairDepths(NamedTuple):
 
 
 def parts_of(kind: ObstructionKind) -> tuple[tuple[float, ObstructionKind], ...]:
-    """What a kind of obstruction is by lot, and how often; itself always where it is one alone."""
+    """Kinds that an obstruction is by lot, each with how often; itself where it is one alone."""
     return getattr(kind, "parts", ((1.0, kind),))
 
 

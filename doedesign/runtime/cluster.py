@@ -78,7 +78,7 @@ def _client(address: str) -> "Iterator[Client]":
         try:
             client.wait_for_workers(1, timeout=_PATIENCE_S)
         except TimeoutError as error:
-            cure = f"Start some, each with one thread: dask worker {address} --nthreads 1"
+            cure = f"Start some, each with one thread: dask worker {address}"
             raise InputError(address, "the cluster must have workers", "none", cure) from error
         yield client
 

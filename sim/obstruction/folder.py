@@ -166,6 +166,9 @@ def _averages(rows: Float[np.ndarray, "n m"], count: int, step: float, start: fl
 def read_mask(path: Path) -> MaskPicture:
     """Read a mask and its size; an InputError for no picture, one that covers nothing, or a size that is no length."""
     values = read_pixels(path, others="RGBA")
+    if values.dtype.kind not in "bfui":
+        raise InputError(str(path), "a mask must hold numbers", str(values.dtype), "Save it as grey values.")
+    values = values.astype(np.uint8) * np.uint8(255) if values.dtype.kind == "b" else values
     full = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
     values = np.clip(np.nan_to_num(values.astype(np.float32)) / np.float32(full), 0, 1)
     mask, colour = _parted(values.reshape(*values.shape[:2], -1))

@@ -46,7 +46,7 @@ class DirtRaindropFence(WithLimits):
 
     @property
     def parts(self) -> tuple[tuple[float, ObstructionKind], ...]:
-        """What it is, and how often."""
+        """The kinds that it is by lot, each with how often."""
         rest = max(1 - self.dirt_share - self.raindrop_share, 0.0)
         return (self.dirt_share, self.dirt), (self.raindrop_share, self.raindrop), (rest, self.fence)
 

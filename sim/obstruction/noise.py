@@ -70,11 +70,12 @@ def layered_noise(
 ) -> Float[np.ndarray, "y x"]:
     """Noise of several scales (`octaves`), each half as wide as the one before, low-pass filtered; float32.
 
-    Lengths are in pixels: `cell` the width of the widest cells, whose scale has Perlin's amplitude, and `blur` the
-    sigma of the Gaussian. Scales with cells below two pixels are left out. `persistence` is the amplitude of a scale
-    over that of the one before.
+    Lengths are in pixels: `cell` the width of the widest cells, at least two, whose scale has Perlin's amplitude, and
+    `blur` the sigma of the Gaussian. Finer scales with cells below two pixels are left out. `persistence` is the
+    amplitude of a scale over that of the one before.
     """
-    margin = int(np.ceil(_REACH * blur))
+    # The widest, too: finer cells are noise of pixels, and their vectors more than those.
+    cell, margin = max(cell, 2.0), int(np.ceil(_REACH * blur))
 
     def low_pass(weights: Float[np.ndarray, "n j"]) -> Float[np.ndarray, "m j"]:
         return gaussian_filter1d(weights, blur, axis=0, truncate=_REACH)[margin:-margin] if margin else weights

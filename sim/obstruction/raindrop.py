@@ -267,7 +267,7 @@ class DirtRaindrop(WithLimits):
 
     @property
     def parts(self) -> tuple[tuple[float, ObstructionKind], ...]:
-        """What it is, and how often."""
+        """The kinds that it is by lot, each with how often."""
         return (self.dirt_share, self.dirt), (1 - self.dirt_share, self.raindrop)
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:

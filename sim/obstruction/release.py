@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
+from fab.errors import InputError
+from fab.units import format_length
 from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb, srgb_from_linear
 from sim.obstruction.fence import Fence
@@ -21,6 +23,7 @@ from sim.obstruction.noise import gradients, perlin
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
+_LEAST_PX = 4  # pixels of a cell; of finer ones the tile is larger than memory
 _CELLS = 8  # noise cells along each side of the release's tile
 _CELL_M = 64 * 3.7e-6 * 0.12 / 8e-3  # their width on the glass: 64 pixels of 3.7 um at 12 cm behind 8 mm
 
@@ -44,6 +47,9 @@ class ReleaseDirt(WithLimits):
         """Draw one dirty glass."""
         view.require(background)
         depth_m = draw_from(rng, self.depth_m)
+        if view.pixels(_CELL_M, depth_m) < _LEAST_PX:
+            rule = f"must be so near that cells of {format_length(_CELL_M)} have {_LEAST_PX} pixels"
+            raise InputError(f"{self.name}: depth_m", rule, format_length(depth_m), "Give a smaller depth.")
         spans = [n / view.pixels(_CELL_M, depth_m) for n in view.shape]
         cells = [max(_CELLS, int(np.ceil(span))) for span in spans]
         lattice = gradients(rng, (cells[0] + 1, cells[1] + 1))

@@ -78,6 +78,8 @@ class Sensor:
         for name in ("read_noise_e", "dark_e"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"`{name}` must be at least 0, but got {getattr(self, name)}")
+        if self.counts_photons and self.dark_e >= self.full_well_e:
+            raise ValueError(f"`dark_e` must lie below the full well, {self.full_well_e:g}, but got {self.dark_e}")
         if not self.quantum_efficiency or not all(0 < q <= 1 for q in self.quantum_efficiency):
             raise ValueError(f"`quantum_efficiency` must lie between 0 and 1, but got {self.quantum_efficiency}")
         if self.bits is not None and not 1 <= self.bits <= _MOST_BITS:

@@ -34,6 +34,8 @@ def test_a_bracket_has_the_true_rate_and_the_noise_it_claims(rng: np.random.Gene
     frames = [exposed(rate, t, rng) for t in exposures]
     merged = merge_exposures(frames, exposures, [BLACK] * 3, NOISE)
     assert merged.valid.all()
+    same = merge_exposures(frames, exposures, [np.float32(BLACK)] * 3, NOISE)
+    np.testing.assert_array_equal(same.rate, merged.rate)
     pull = (merged.rate - rate) / np.sqrt(merged.variance(rate))
     # Of 60000 standard normals the mean and the variance are known to 0.004 and 0.006; four times that.
     assert abs(pull.mean()) < 0.016

@@ -191,6 +191,8 @@ def test_what_cannot_be_a_sensor():
         # In tests the annotations are checked first, which refuses the two unknown names.
         with pytest.raises((ValueError, TypeError), match=name):
             Sensor(**wrong)
+    with pytest.raises(ValueError, match="`dark_e` must lie below the full well, 10000, but got 10000"):
+        Sensor(dark_e=10000.0)
     with pytest.raises(ValueError, match="quantum_efficiency"):
         Sensor(quantum_efficiency=(0.3, 0.4)).white_e(3)
     with pytest.raises(ValueError, match="red, green and blue"):

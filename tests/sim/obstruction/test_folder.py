@@ -98,7 +98,9 @@ def test_a_mask_without_colour_takes_the_one_given(tmp_path: Path):
     np.testing.assert_allclose(radiance[:, 3, 4], expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["16-bit png", "16-bit tiff", "float tiff", "1 bit", "rgb", "opaque rgba", "palette"])
+@pytest.mark.parametrize(
+    "kind", ["16-bit png", "16-bit tiff", "float tiff", "1-bit tiff", "1 bit", "rgb", "opaque rgba", "palette"]
+)
 def test_kinds_of_files(tmp_path: Path, kind: str):
     values = np.zeros((20, 30))
     values[4:8, 10:20] = 1
@@ -107,6 +109,8 @@ def test_kinds_of_files(tmp_path: Path, kind: str):
         tifffile.imwrite(path, (values * 65535).astype(np.uint16))
     elif kind == "float tiff":
         tifffile.imwrite(path, values.astype(np.float32))
+    elif kind == "1-bit tiff":
+        Image.fromarray(values > 0).save(path)
     elif kind == "16-bit png":
         Image.fromarray((values * 65535).astype(np.uint16)).save(path)
     else:

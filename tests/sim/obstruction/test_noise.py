@@ -62,3 +62,8 @@ def test_scales_below_two_pixels_are_left_out(rng: np.random.Generator):
     two = layered_noise(rng, (32, 32), 5.0, octaves=2)
     rng.bit_generator.state = state
     np.testing.assert_array_equal(layered_noise(rng, (32, 32), 5.0, octaves=9), two)
+    found = []
+    for cell in (0.01, 2.0):  # finer ones would need more vectors than there are pixels, without end
+        rng.bit_generator.state = state
+        found.append(layered_noise(rng, (32, 32), cell))
+    np.testing.assert_array_equal(*found)

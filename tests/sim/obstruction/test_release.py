@@ -92,3 +92,11 @@ def test_the_contrast_of_a_fence_changes_about_its_mean(monkeypatch: pytest.Monk
 def test_what_cannot_be_meant_is_refused(kind: type[ReleaseDirt]):
     with pytest.raises(InputError, match=f"{kind.name}: depth_m: must"):
         kind(depth_m=(0.0, 0.1))
+
+
+def test_release_dirt_is_not_finer_than_the_pixels(rng: np.random.Generator):
+    """Far away its tile would not fit into memory."""
+    view = CameraView((64, 64), 3.7e-6, 8e-3)
+    background = np.zeros((3, 64, 64), np.float32)
+    with pytest.raises(InputError, match="release_dirt: depth_m: must be so near"):
+        ReleaseDirt(depth_m=(50.0, 50.0)).draw(rng, view, background)
