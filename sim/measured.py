@@ -72,7 +72,7 @@ def merge_exposures(
     """
     names = tuple(names) or tuple(f"image {i}" for i in range(len(frames)))
     shape = frames[0].counts.shape
-    lights, floors, usable = [], [], []
+    lights, floors, heats, usable = [], [], [], []
     for frame, exposure, dark, name in zip(frames, exposures, darks, names, strict=True):
         if frame.counts.shape != shape:
             got = f"{frame.counts.shape} against {shape}"
@@ -80,9 +80,10 @@ def merge_exposures(
             raise InputError(name, rule, got, "Give frames of one camera.")
         if not 0 < exposure < np.inf:
             raise InputError(name, "an exposure must be positive", exposure, "Give its length.")
-        light, floor = _without_dark(frame, dark, noise, dark_count, name)
+        light, floor, heat = _without_dark(frame, dark, noise, dark_count, name)
         lights.append(light)
         floors.append(floor)
+        heats.append(heat)
         top = frame.clipped_at if clipped_at is None else clipped_at
         usable.append(frame.valid if top is None else np.logical_and(frame.valid, frame.counts < top - frame.step / 2))
     times = np.asarray(exposures, np.float64)[:, None, None]
@@ -90,7 +91,10 @@ def merge_exposures(
     valid = used.any(axis=0)
     if valid.sum() < 0.01 * sum(frame.valid.sum() for frame in frames) / len(frames):
         raise InputError(names[int(np.argmin(exposures))], "some pixels must not be saturated", "hardly any", _SHORTER)
-    return _merged(np.stack(lights), np.stack(floors), used, times, noise.gain_e)._replace(valid=valid)
+    # One dark frame for all is the same noise in all.
+    shared = len(frames) > 1 and all(dark is darks[0] for dark in darks)
+    light, floor, heat = (np.stack(each) for each in (lights, floors, heats))
+    return _merged(light, floor, heat, used, times, noise.gain_e, shared)._replace(valid=valid)
 
 
 _SHORTER = "Add a shorter exposure, or check `saturation`."
@@ -98,12 +102,12 @@ _SHORTER = "Add a shorter exposure, or check `saturation`."
 
 def _without_dark(
     frame: CameraFrame, dark: CameraFrame | float, noise: Noise, dark_count: int, name: str
-) -> tuple[Image, Image]:
-    """Counts above black, and their variance without light."""
+) -> tuple[Image, Image, Image]:
+    """Counts above black, their variance without light, and that which the dark frame has besides."""
     read = (noise.read_e / noise.gain_e) ** 2 + frame.step**2 / 12
     if not isinstance(dark, CameraFrame):
         light = frame.counts.astype(np.float64) - dark
-        floor = np.full(light.shape, read)
+        floor, own = np.full(light.shape, read), np.zeros(light.shape)
     else:
         if dark.counts.shape != frame.counts.shape:
             got = f"{dark.counts.shape} against {frame.counts.shape}"
@@ -111,30 +115,33 @@ def _without_dark(
         light = frame.counts.astype(np.float64) - dark.counts
         # Electrons that heat sets free are as noisy as those of light; where a dark frame is bright, both frames are.
         heat = np.maximum(dark.counts - np.median(dark.counts[frame.valid]), 0) / noise.gain_e
-        floor = (read + heat) * (1 + 1 / dark_count)
+        floor, own = read + heat, (read + heat) / dark_count
     if not light[frame.valid].mean() > 0:
         got = f"a mean of {light[frame.valid].mean():.4g} counts above dark"
         raise InputError(name, "an image must be brighter than its dark frame", got, "Check which is which.")
-    return light, floor
+    return light, floor, own
 
 
 def _merged(
     light: Float[np.ndarray, "n y x"],
     floor: Float[np.ndarray, "n y x"],
+    of_darks: Float[np.ndarray, "n y x"],
     used: Bool[np.ndarray, "n y x"],
     times: Float[np.ndarray, "n 1 1"],
     gain_e: float,
+    shared: bool,
 ) -> MeasuredPsf:
     """Mean of the rates, weighted by their inverse variance; zero where nothing is usable."""
     total = np.maximum((used * times).sum(axis=0), np.finfo(float).tiny)
     first = np.maximum((used * light).sum(axis=0) / total, 0.0)
-    variance = floor + first * times / gain_e
+    variance = floor + of_darks + first * times / gain_e
     # Where nothing is noisy all count alike.
     weight = used * times**2 / np.maximum(variance, 1e-9 * variance.max() or 1.0)
     share = weight / np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
+    dark = (share / times).sum(axis=0) ** 2 * of_darks[0] if shared else (share**2 * of_darks / times**2).sum(axis=0)
     return MeasuredPsf(
         rate=(share * light / times).sum(axis=0),
-        floor=(share**2 * floor / times**2).sum(axis=0),
+        floor=(share**2 * floor / times**2).sum(axis=0) + dark,
         slope=(share**2 / (times * gain_e)).sum(axis=0),
         valid=np.asarray(used.any(axis=0)),
     )

@@ -28,6 +28,7 @@ from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import open_design
 from doedesign.runs.results import results_folder
 from doedesign.runtime.progress import meter
+from fab.errors import InputError
 from fab.figure import html_of
 from fab.process import Normal, Process
 from sim.camera import Colour
@@ -152,6 +153,9 @@ def calibrate(
     Raises:
         InputError: an unknown error, a measurement that does not fit, or a folder that holds something else.
     """
+    for name, value in (("evaluations", evaluations), ("polish", polish), ("seed", seed)):
+        if value < 0:
+            raise InputError(name, "must be 0 or more", value, "Leave it out, or give another.")
     design = open_design(design, masks)
     prior = design.process(process)
     unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # refuses mistakes before files are read

@@ -88,13 +88,18 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
     for i, one in enumerate(names):
         for j, other in enumerate(names):
             if relative(one) and _key(one) == _key(other):
-                covariance[i, j] += prior_sigma(process, f"{_key(one)}[0]") ** 2
+                covariance[i, j] += _reference_sigma(process, _key(one)) ** 2
     root = np.linalg.cholesky(covariance)
     reach = _REACH * np.sqrt(np.diag(covariance))
     limits = np.array([_limit(name, names, pitch_m) for name in names])
     low, high = np.maximum(mean - reach, -limits), np.minimum(mean + reach, limits)
     one_sided = np.array([deviation_of(name).one_sided for name in names])
     low = np.where(one_sided, np.maximum(low, 0.0), low)
+    for name, least, most in zip(names, low, high, strict=True):
+        if least >= most:
+            rule = "must have a mean that the model follows, and room about it"
+            got = f"{process.spreads.get(name, Normal()).mean:g}"
+            raise InputError(f"process: {name}", rule, got, "Leave this error out, or choose a process nearer to it.")
     # What a rounded corner does grows with its radius squared: at zero nothing says which way is better.
     start = np.clip(np.where(one_sided & (mean < sigma / 2), sigma / 2, mean), low, high)
     return Unknowns(process, names, mean, root, low, high, start)
@@ -103,6 +108,12 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
 def prior_sigma(process: Process, name: str) -> float:
     """Standard deviation of an error before a calibration, by its flat name: the process's, or else what is assumed."""
     return process.spreads.get(name, Normal()).sigma or deviation_of(name).prior_sigma
+
+
+def _reference_sigma(process: Process, key: str) -> float:
+    """Prior standard deviation of mask 0, which all others are relative to: 0 where a process says so of it alone."""
+    said = [process.spreads.get(f"{key}[{mask}]", Normal()).sigma for mask in range(process.masks)]
+    return said[0] if any(said) else prior_sigma(process, f"{key}[0]")
 
 
 def definite_means(process: Process) -> dict[str, float]:

@@ -82,9 +82,17 @@ def _fitted(masks: Sequence[MaskMeasured], lag: float) -> tuple[float, dict[int,
 
 
 def _mask_errors(
-    process: Process, mean: Mapping[str, float], bit: int, mask: MaskMeasured, depth_m: float | None
+    process: Process,
+    mean: Mapping[str, float],
+    bit: int,
+    mask: MaskMeasured,
+    depth_m: float | None,
+    marks_m: tuple[float, float],
 ) -> dict[str, float]:
-    """Measured numbers of one mask as errors by flat name, given the process's means."""
+    """Measured numbers of one mask as errors by flat name, given the process's means.
+
+    The marks that overlay is measured against lie off at the die by `marks_m` (y, x).
+    """
     found = {}
     times = 1 if mask.times_etched is None else mask.times_etched
     if depth_m is not None and times:
@@ -96,10 +104,28 @@ def _mask_errors(
     y, x = process.die_m
     turn, growth = mean[f"rotation_rad[{bit}]"], mean[f"magnification[{bit}]"]
     if mask.overlay_y_m is not None:
-        found[f"overlay_y_m[{bit}]"] = mask.overlay_y_m - growth * y - turn * x
+        found[f"overlay_y_m[{bit}]"] = mask.overlay_y_m + marks_m[0] - growth * y - turn * x
     if mask.overlay_x_m is not None:
-        found[f"overlay_x_m[{bit}]"] = mask.overlay_x_m - growth * x + turn * y
+        found[f"overlay_x_m[{bit}]"] = mask.overlay_x_m + marks_m[1] - growth * x + turn * y
     return found
+
+
+def _marks_m(process: Process, mean: Mapping[str, float], reference: int | None) -> tuple[float, float]:
+    """Where the marks of a mask lie at the die (y, x) by the process's means; those of a zero layer, where they should.
+
+    Args:
+        process: the process.
+        mean: its means by flat name.
+        reference: bit of the mask; None for a zero layer.
+    """
+    if reference is None:
+        return 0.0, 0.0
+    y, x = process.die_m
+    turn, growth = mean[f"rotation_rad[{reference}]"], mean[f"magnification[{reference}]"]
+    return (
+        mean[f"overlay_y_m[{reference}]"] + growth * y + turn * x,
+        mean[f"overlay_x_m[{reference}]"] + growth * x - turn * y,
+    )
 
 
 def as_built_doe(measured: AsBuilt, process: Process) -> AsBuiltDoe:
@@ -112,26 +138,28 @@ def as_built_doe(measured: AsBuilt, process: Process) -> AsBuiltDoe:
     values = mean | dict.fromkeys(_COMMON, 0.0)
     lag, depths_m, per_m = _fitted(measured.masks, mean["etch_lag"])
     found = {} if per_m is None else {"etch_lag": lag}
+    marks_m = _marks_m(process, mean, measured.reference)
     for bit, mask in enumerate(measured.masks):
         # The common parts count with the mask's own.
         values[f"depth_scale[{bit}]"] = (1 + mean["common_depth_scale"]) * (1 + mean[f"depth_scale[{bit}]"]) - 1
         values[f"cd_bias_m[{bit}]"] += mean["common_cd_bias_m"]
-        found |= _mask_errors(process, mean, bit, mask, depths_m.get(bit))
+        found |= _mask_errors(process, mean, bit, mask, depths_m.get(bit), marks_m)
     plain = {
         "corner_radius_m": measured.corner_radius_m,
         "sidewall_rad": measured.sidewall_rad,
-        "chrome_x_m": measured.chrome.overlay_x_m,
-        "chrome_y_m": measured.chrome.overlay_y_m,
+        "chrome_x_m": None if (x_m := measured.chrome.overlay_x_m) is None else x_m + marks_m[1],
+        "chrome_y_m": None if (y_m := measured.chrome.overlay_y_m) is None else y_m + marks_m[0],
         "chrome_diameter_m": measured.chrome.wider_m,
     }
     found |= {name: value for name, value in plain.items() if value is not None}
     values |= found
+    stated = dict(values)
     for bit, mask in enumerate(measured.masks):
         values[f"cd_bias_m[{bit}]"] += mask.edge_move_m
     repeats = tuple(0 if mask.times_etched is None else mask.times_etched - 1 for mask in measured.masks)
     sources = {
         name: "measured" if name in found else "process mean" if value else "not measured, taken as 0"
-        for name, value in values.items()
+        for name, value in stated.items()
         if name not in _COMMON
     }
     given = {name: value for name, value in values.items() if value}

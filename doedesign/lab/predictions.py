@@ -118,7 +118,7 @@ def rank_importance(design: Design, process: Process, wavelength_m: float) -> tu
     side_m = max(small.grid.extent_m)
     keys = [EXPECTED, *one_at_a_time_keys(kept)]
     made = partial(as_fabricated, level, small, wavelengths_m=(wavelength_m,))
-    nominal = made(Process(kept.levels), Variation())
+    nominal = made(Process((design.aim or design.level_map).levels), Variation())  # the plate that should come out
     draws = {}
     for key in keys:
         surface = made(there, variation_at(there, 0, side_m, key))
@@ -191,8 +191,8 @@ def predict_sheet(
     moved = with_edge_moves(process, edge_moves_m)
     middle = len(design.near_m) // 2
     # All depths would take most of the time of a whole order, and say the same.
-    near_m = design.near_m[middle : middle + 1]
-    design = replace(design, near_m=near_m, far_m=() if near_m else design.far_m[-1:])
+    near_m = tuple(sorted(design.near_m)[middle : middle + 1])
+    design = replace(design, near_m=near_m, far_m=() if near_m else (max(design.far_m),))
     with ThreadPoolExecutor(1) as pool:
         ranked = pool.submit(rank_importance, design, moved, design_m)
         as_drawn, expected = _predictions(design, moved)

@@ -198,9 +198,9 @@ def plot_effects(effects: Sequence[Effect], ax: "Axes | None" = None) -> "Figure
 
 
 def _reach(effect: Effect) -> float:
-    """Distance by which an error moves its quantity."""
-    moved = (abs(value - effect.expected) for value in (effect.low, effect.high) if value is not None)
-    return max((one for one in moved if math.isfinite(one)), default=0.0)
+    """Distance by which an error moves its quantity; infinite where it leaves the model."""
+    moved = [abs(value - effect.expected) for value in (effect.low, effect.high) if value is not None]
+    return max((one for one in moved if not math.isnan(one)), default=0.0)
 
 
 def _plot_bars(axes: "Axes", shown: Sequence[Effect], scale: float) -> None:
@@ -211,7 +211,12 @@ def _plot_bars(axes: "Axes", shown: Sequence[Effect], scale: float) -> None:
             if value is not None and math.isfinite(value):
                 axes.barh(position + offset, scale * value - expected, 0.36, expected, color=hue)
                 ends.append(scale * value)
-    room = 0.06 * (max(ends) - min(ends))
+    room = 0.06 * (max(ends) - min(ends)) or 0.06 * (abs(expected) or 1.0)
+    for position, effect in enumerate(shown):
+        for value, hue, offset in ((effect.low, _LOWER, -0.2), (effect.high, _HIGHER, 0.2)):
+            if value is not None and math.isinf(value):  # beyond the model: to the end of the axis
+                end = (max(ends) if value > 0 else min(ends)) + math.copysign(room, value)
+                axes.barh(position + offset, end - expected, 0.36, expected, color=hue, hatch="////", edgecolor="white")
     axes.axvline(expected, color=INK, lw=0.8)
     axes.set(xlim=(min(ends) - room, max(ends) + room), ylim=(len(shown) - 0.4, -0.6))
     axes.set_yticks(range(len(shown)), [error_label(c.error) for c in shown])

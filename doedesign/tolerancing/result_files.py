@@ -9,6 +9,7 @@ manifest.json   SHA-256 of all these
 
 import csv
 import io
+import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
     from doedesign.tolerancing.results import ToleranceResult
+
+log = logging.getLogger("doedesign")
 
 
 def write_results(folder: Path, result: "ToleranceResult") -> None:
@@ -65,6 +68,9 @@ def _draw(folder: Path, result: "ToleranceResult") -> list[str]:
     # By a worker: it finds there what the others have compiled, and gives the same bytes whatever this process is like.
     model = DrawModel(predicted_bank, design, study.process)
     for key, bank in evaluate_here(model, {key: study.variation(key) for key in shown}, 1):
+        if isinstance(bank, OutOfModel):  # another evaluation may follow what this one does not
+            log.info("no PSFs of %s: %s", key, bank.reason)
+            continue
         whose = f"{design.name}, {'as drawn' if key == NOMINAL else f'worst plate ({key})'}"
         drawn[shown[key]] = plot_psfs(bank, design.camera, design.near_m, design.far_m, title=whose)
     for name, picture in drawn.items():

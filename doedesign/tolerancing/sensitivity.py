@@ -62,7 +62,12 @@ def _variance(low: float | None, expected: float, high: float) -> float:
 
 
 def source_shares(effects: Sequence[Effect], quantity: str) -> dict[str, float]:
-    """Approximate share of each source in a quantity's variance, if errors do not act together; largest first."""
+    """Approximate share of each source in a quantity's variance, if errors do not act together; largest first.
+
+    None where an error leaves the model: nothing is known of what it does, and it may well do the most.
+    """
+    if any((one.quantity, one.colour) == (quantity, None) and _leaves(one) for one in effects):
+        return {}
     variances = dict.fromkeys((error.source for error in DEVIATIONS.values()), 0.0)
     for effect in effects:
         if (effect.quantity, effect.colour) == (quantity, None) and np.isfinite(effect.variance):
@@ -70,6 +75,12 @@ def source_shares(effects: Sequence[Effect], quantity: str) -> dict[str, float]:
     total = sum(variances.values())
     shares = {source: value / total for source, value in variances.items() if value > 0}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+def _leaves(effect: Effect) -> bool:
+    """Whether one standard deviation of an error leaves the model where its mean does not."""
+    ends = [end for end in (effect.low, effect.high) if end is not None]
+    return bool(np.isfinite(effect.expected) and not np.isfinite(ends).all())
 
 
 class SensitivityIndex(NamedTuple):

@@ -61,6 +61,7 @@ class AsBuilt:
         grating_blazed: the same of the blazed grating.
         notes: wafer, date and remarks, as text.
         predicted: what the sheet predicted ("as_drawn", "expected", "probe_wavelength_nm" ...); None if nothing.
+        reference: bit of the mask whose marks overlay was measured against; None where a zero layer has them.
     """
 
     level_map_sha256: str
@@ -72,6 +73,7 @@ class AsBuilt:
     grating_blazed: float | None
     notes: Mapping[str, str]
     predicted: Mapping[str, Any] | None
+    reference: int | None = None
 
 
 class _Table:
@@ -254,5 +256,6 @@ def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
         grating_binary=gratings[0],
         grating_blazed=gratings[1],
         notes={key: text for key, text in said.items() if text is not None},
+        reference=names.index(data["reference"]) if data.get("reference") in names else None,
         predicted=predicted if isinstance(predicted, Mapping) else None,
     )

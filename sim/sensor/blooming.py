@@ -33,7 +33,7 @@ def bloomed(signal: Signal, full: "float | Array | np.ndarray", spilled: float) 
     """
     if not is_traced(full) and not np.all(np.asarray(full) > 0):
         raise InputError("full", "must be positive", str(full), "Give the full well in the unit of the signal.")
-    if not is_traced(spilled) and not 0 <= spilled <= 1:
+    if not 0 <= spilled <= 1:
         raise InputError("spilled", "must lie from 0 to 1", f"{spilled:g}", "0 is for a sensor without blooming.")
     signal = jnp.asarray(signal)
     return _bloomed(signal, jnp.broadcast_to(jnp.asarray(full), signal.shape), jnp.asarray(spilled))

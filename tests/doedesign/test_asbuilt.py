@@ -246,6 +246,31 @@ def test_verniers_and_pads_tell_of_the_place_of_the_die():
     assert found.value("depth_scale[0]") == pytest.approx(0, abs=1e-12)
 
 
+def test_overlay_is_measured_against_the_marks_of_a_mask_that_lies_off_itself():
+    """Mask 1 by 0.5 um, as the process says, and the second by 0.1 um more at the die, where the first is turned."""
+    spreads = spreads_of(LEVELS, overlay_x_m=(0.0, 0.0), rotation_rad=(0.0, 0.0))
+    spreads |= {"overlay_x_m[0]": Normal(0.5 * UM), "rotation_rad[0]": Normal(1e-5)}
+    process = Process(LEVELS, spreads=spreads, die_m=(20e-3, 0.0))
+    chrome = BARE._replace(overlay_x_m=0.2 * UM)
+    asked = measured(NOTHING, NOTHING._replace(overlay_x_m=0.1 * UM), chrome=chrome, reference=0)
+    found = as_built_doe(asked, process).variation
+    assert found.value("overlay_x_m[0]") == pytest.approx(0.5 * UM)
+    assert found.value("overlay_x_m[1]") == pytest.approx((0.5 + 0.1 - 0.2) * UM)
+    assert found.chrome_x_m == pytest.approx((0.5 + 0.2 - 0.2) * UM)
+    # Those of a zero layer lie where they should.
+    zero = as_built_doe(asked.__class__(**{**vars(asked), "reference": None}), process).variation
+    assert zero.value("overlay_x_m[1]") == pytest.approx(0.1 * UM)
+
+
+@pytest.mark.parametrize(
+    ("mean_m", "moved_m", "source"), [(0.0, -80 * NM, "not measured, taken as 0"), (80 * NM, -80 * NM, "process mean")]
+)
+def test_sources_are_those_of_errors_and_not_of_what_was_moved_on_the_mask(mean_m: float, moved_m: float, source: str):
+    process = Process(LEVELS, spreads=spreads_of(LEVELS, cd_bias_m=(mean_m, 0.0)))
+    taken = as_built_doe(measured(NOTHING._replace(edge_move_m=moved_m), NOTHING), process).taken
+    assert next(one.source for one in taken if one.error == "cd_bias_m[0]") == source
+
+
 def test_gratings_are_as_deep_as_the_pads_beside_them():
     """Pads of the drawn depths are gratings as drawn, also where the process is known to etch deeper at the die."""
     process = Process(LEVELS, spreads=spreads_of(LEVELS, radial_nonuniformity=(0.04, 0.0)), die_m=(40e-3, 0.0))

@@ -1,8 +1,12 @@
 """What is looked for, how far, and what is believed of it before."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
+from doedesign.calibration.estimate import calibrate
 from doedesign.calibration.unknowns import unknowns_of
 from fab.errors import InputError
 from fab.levels import Levels
@@ -59,6 +63,22 @@ def test_places_of_masks_share_that_of_mask_0():
         unknowns_of(three, ["overlay_x[0]"], PITCH_M)
 
 
+def test_a_mask_0_that_is_known_exactly_is():
+    """As the estimate of a calibration says, to which all others are relative."""
+    spreads = {"overlay_x_m[1]": Normal(1e-7, 1e-8)}
+    found = unknowns_of(Process(Levels(4, 0.1e-6), spreads=spreads, name="known"), ["overlay_x"], PITCH_M)
+    assert found.sigma == pytest.approx([1e-8])
+    # A process that says nothing of overlay leaves both to be assumed.
+    silent = unknowns_of(Process(Levels(4, 0.1e-6), name="silent"), ["overlay_x"], PITCH_M)
+    assert silent.sigma == pytest.approx([np.sqrt(2) * 1e-6])
+
+
+def test_a_mean_that_no_model_follows_is_told():
+    spreads = {"common_cd_bias_m": Normal(0.3e-6, 0.01e-6)}
+    with pytest.raises(InputError, match="common_cd_bias_m: must have a mean that the model follows"):
+        unknowns_of(Process(Levels(4, 0.1e-6), spreads=spreads), ["cd"], 1e-6)
+
+
 def test_scores_are_standard_normal():
     names = {"overlay_x_m[0]": 3e-7, "overlay_x_m[1]": 4e-7, "overlay_x_m[2]": 2e-7}
     three = Process(Levels(8, 0.1e-6), spreads={n: Normal(1e-7, s) for n, s in names.items()}, name="three")
@@ -68,3 +88,10 @@ def test_scores_are_standard_normal():
     drawn = np.array([found.values(z) for z in np.random.default_rng(2).normal(size=(20000, 2))])
     np.testing.assert_allclose(np.cov(drawn.T), found.root @ found.root.T, rtol=0.05)  # of 20000: 0.7 % each
     np.testing.assert_allclose(drawn.mean(axis=0), found.mean, atol=2e-8)
+
+
+@pytest.mark.parametrize("number", ["evaluations", "polish", "seed"])
+def test_a_search_without_end_or_a_seed_below_0_is_refused(number: str):
+    wrong: dict[str, Any] = {number: -1}
+    with pytest.raises(InputError, match=f"{number}: must be 0 or more, but got -1"):
+        calibrate(Path("none"), Path("none.toml"), **wrong)

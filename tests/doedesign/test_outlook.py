@@ -126,6 +126,20 @@ def test_compensated_masks_bring_the_expected_plate_back(design):
     assert predict_sheet(design, process, 550e-9).predictions.expected[0].strehl < 0.99
 
 
+@pytest.mark.slow
+def test_errors_are_ranked_about_the_plate_that_should_come_out(design):
+    """Depths that are commanded 10 % short, for the process etches 10 % too deep, rank as those of an ideal one."""
+    short = Levels(LEVELS.count, LEVELS.step_m, tuple(depth / 1.1 for depth in LEVELS.depths_m))
+    commanded = replace(design, level_map=replace(design.level_map, levels=short), aim=design.level_map)
+    wide = {"cd_bias_m[3]": Normal(0.0, 0.1 * UM)}
+    deep = Process(short, spreads={**wide, "common_depth_scale": Normal(0.1, 0.022)})
+    ideal = Process(LEVELS, spreads={**wide, "common_depth_scale": Normal(0.0, 0.02)})
+    found, wanted = rank_importance(commanded, deep, 550e-9), rank_importance(design, ideal, 550e-9)
+    assert [one.measured for one in found] == [one.measured for one in wanted]
+    for one, other in zip(found, wanted, strict=True):
+        assert one.strehl == pytest.approx(other.strehl, abs=0.01)  # 0.9 and 0.1 about the commanded plate
+
+
 def test_what_is_closed_does_not_count(design):
     pattern = np.tile(np.random.default_rng(3).integers(0, 16, (8, 8)), (8, 8)).astype(np.uint8)
 

@@ -18,7 +18,7 @@ from doedesign.tolerancing.analysis import QUANTITIES, Sample, limit_from_text, 
 from doedesign.tolerancing.budget import budget_of
 from doedesign.tolerancing.pool import DrawModel, OutOfModel, Rows
 from doedesign.tolerancing.results import ToleranceResult, tolerance
-from doedesign.tolerancing.sensitivity import source_shares
+from doedesign.tolerancing.sensitivity import Effect, source_shares
 from doedesign.tolerancing.studies import Study, study
 from fab.errors import InputError
 from fab.process import Normal, Process, Variation
@@ -220,6 +220,16 @@ def test_one_at_a_time_finds_slope_and_curvature(ask: Callable[..., Study]):
     assert corners.low is None
     assert corners.variance == pytest.approx((1 - 2 / math.pi) * 0.02**2)
     assert changes["overlay_x_m[0]", "zeroth_order", None].variance == 0
+
+
+def test_an_error_that_leaves_the_model_leaves_nothing_to_share():
+    """It may well do the most; what the others do is no share of the whole."""
+    known = Effect("depth_scale[0]", "depth", "strehl", None, 0.9, 1.0, 0.9, 0.01)
+    assert source_shares([known], "strehl") == {"depth": 1.0}
+    beyond = Effect("overlay_x_m[0]", "overlay", "strehl", None, -math.inf, 1.0, -math.inf, math.nan)
+    assert source_shares([known, beyond], "strehl") == {}
+    of_a_colour = beyond._replace(colour="red")
+    assert source_shares([known, of_a_colour], "strehl") == {"depth": 1.0}
 
 
 @pytest.mark.slow

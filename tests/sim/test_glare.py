@@ -67,7 +67,7 @@ def test_drains_take_their_share():
     signal = np.zeros((21, 1))
     signal[10] = 9.0
     assert np.asarray(bloomed(signal, 1.0, 0.25)).sum() == pytest.approx(1 + 0.25 * 8, rel=1e-6)
-    traced = jax.jit(lambda full, spilled: bloomed(signal, full, spilled).sum())(1.0, 0.25)
+    traced = jax.jit(lambda full: bloomed(signal, full, 0.25).sum())(np.ones((1, 1), np.float32))
     assert float(traced) == pytest.approx(1 + 0.25 * 8, rel=1e-6)
     assert np.asarray(bloomed(signal, 1.0, 0.0)).sum() == pytest.approx(1)
 
