@@ -220,11 +220,13 @@ def test_captures_of_one_process_are_none_of_another(run: Path, images: Path, tm
     for die_m in ((0.0, 0.0), (0.03, 0.03)):
         plate = PlateErrors(Process(design.levels, die_m=die_m), errors, "errors of a file")
         out = tmp_path / f"{die_m[0]}"
-        simulate_files(design, out, images, occlusion="radiometric", count=1, plate=plate)
+        simulate_files(design, out, images, obstruction="dirt", occlusion="radiometric", count=1, size=32, plate=plate)
         seen.add(read_json(out / "manifest.json")["settings_sha256"])
     assert len(seen) == 2
     with pytest.raises(InputError, match="must belong to"):
-        simulate_files(design, tmp_path / "0.0", images, occlusion="radiometric", count=1, plate=plate)
+        simulate_files(
+            design, tmp_path / "0.0", images, obstruction="dirt", occlusion="radiometric", count=1, size=32, plate=plate
+        )
 
 
 def test_a_mosaic(run: Path, images: Path, tmp_path: Path):
