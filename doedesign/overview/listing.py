@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 from doedesign.overview.kinds import TABLE_NAME, Record, has_record, record_of
 from doedesign.overview.numbers import MainNumber, main_numbers
+from doedesign.runs.aside import waits
 from doedesign.runs.costs import Cost, costs_of, together
-from doedesign.runs.folder import CHECKPOINT, waits
+from doedesign.runs.folder import CHECKPOINT
 from doedesign.runs.journal import STUDY_NAME
 from doedesign.spec import load_spec
 from fab.archive import read_archive

@@ -17,15 +17,13 @@
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
-process at a time works in a run folder. A run that another one is to take the place of waits in `.doedesign-aside`
-until that one has begun.
+process at a time works in a run folder.
 """
 
 import contextlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,6 +33,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from doedesign import __version__
+from doedesign.runs.aside import ASIDE, replace_aside, restored_unless_replaced, set_aside, waits
 from doedesign.spec import (
     HEIGHT_FILES,
     Spec,
@@ -55,7 +54,6 @@ from fab.files import (
     clear_killed,
     explain_os_error,
     lock,
-    os_errors_explained,
     read_bytes,
     read_json,
     sha256_file,
@@ -199,73 +197,17 @@ def claim_run(
     cure = "Choose another output folder."
     if folder.exists() and not folder.is_dir():
         raise InputError(str(folder), "a run needs a folder", "a file", cure)
-    with alone_in(folder), _replaced_or_restored(folder):
+    with alone_in(folder), restored_unless_replaced(folder):
         known = (folder / MANIFEST_NAME).is_file()
         if not known and any(folder.iterdir()):
             raise InputError(str(folder), "a run needs a new or empty folder, or its own", "other content", cure)
         if known and overwrite and not _belongs(_read_manifest(folder), spec, inputs):
-            _set_aside(folder)
+            set_aside(folder)
             known = False
         run = Run(folder, spec, known and _is_done(folder, spec, inputs), inputs, overrides)
         if run.done:  # perhaps stopped before the last line of `finish_run`
             run.path(CHECKPOINT).unlink(missing_ok=True)
         yield run
-
-
-# Where, in its own folder, a run waits that another one is to take the place of, and what is left of one that was
-# replaced: on one disk, whatever links to it.
-_ASIDE, _REPLACED = ".doedesign-aside", ".doedesign-replaced"
-
-
-def waits(folder: Path) -> bool:
-    """Whether a run that was to be replaced waits in its folder to be brought back, which the next `optimize` does."""
-    return (folder / _ASIDE / MANIFEST_NAME).is_file()
-
-
-@contextlib.contextmanager
-def _replaced_or_restored(folder: Path) -> Iterator[None]:
-    """Bring back a run that nothing took the place of: a mistake was found before the other began, or it was killed."""
-    _restore(folder)
-    try:
-        yield
-    finally:
-        _restore(folder)
-
-
-def _set_aside(folder: Path) -> None:
-    """Move a run aside, its manifest first: what is there without one is no run."""
-    aside = folder / _ASIDE
-    with os_errors_explained(folder):
-        aside.mkdir()
-        _rename_all(sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST_NAME), aside)
-
-
-def _replace(folder: Path) -> None:
-    """Remove the run that waits, for another one has begun; from the first step on it does not come back."""
-    if (folder / _ASIDE).is_dir():
-        with os_errors_explained(folder):
-            (folder / _ASIDE).rename(folder / _REPLACED)
-            shutil.rmtree(folder / _REPLACED)
-
-
-def _restore(folder: Path) -> None:
-    """Move a run back that waits, its manifest last, over what another one began with."""
-    aside = folder / _ASIDE
-    with os_errors_explained(folder):
-        if (folder / _REPLACED).is_dir():
-            shutil.rmtree(folder / _REPLACED)
-        if not aside.is_dir():
-            return
-        if waits(folder):
-            (folder / MANIFEST_NAME).unlink(missing_ok=True)
-        _rename_all(sorted(aside.iterdir(), key=lambda path: path.name == MANIFEST_NAME), folder)
-        aside.rmdir()
-
-
-def _rename_all(paths: Sequence[Path], home: Path) -> None:
-    for path in paths:
-        if path != home:
-            path.rename(home / path.name)
 
 
 def _belongs(found: "_Manifest", spec: Spec, inputs: Mapping[str, str]) -> bool:
@@ -332,7 +274,8 @@ def is_finished(folder: Path) -> bool:
 def begin_run(run: Run) -> None:
     """Write the manifest of a claimed run that begins, its spec, and its pictures.
 
-    The manifest comes first, so that what a kill leaves is known as a run of this spec, which goes on.
+    The manifest comes first, so that what a kill leaves is known as a run of this spec, which goes on; a run that waits
+    to be replaced comes back instead, until all is written.
     """
     lacking = {key: name for key, name in kept_pictures(run.spec).items() if not run.path(name).is_file()}
     pictures = {name: read_bytes(input_files(run.spec, key)[key]) for key, name in lacking.items()}
@@ -340,7 +283,7 @@ def begin_run(run: Run) -> None:
     write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
     for name, content in pictures.items():
         write_atomic(run.path(name), content)
-    _replace(run.folder)
+    replace_aside(run.folder)
 
 
 def finish_run(
@@ -372,7 +315,7 @@ def open_run(folder: Path) -> Run:
     if not (folder / MANIFEST_NAME).is_file():
         cure = "Give the folder optimize wrote."
         if waits(folder):
-            cure = f"A run waits in {_ASIDE}; the next optimize with its spec brings it back."
+            cure = f"A run waits in {ASIDE}; the next optimize with its spec brings it back."
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", cure)
     _require_no_order(folder)
     manifest = _read_manifest(folder, (FORMAT, TRAINING, RELEASED))

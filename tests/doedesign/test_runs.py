@@ -240,7 +240,7 @@ def test_a_run_that_waits_is_told_as_such(done: Run, spec: Spec, monkeypatch: py
 
     def overwritten() -> None:
         with claim_run(done.folder, changed, {}, overwrite=True):
-            monkeypatch.setattr("doedesign.runs.folder._restore", lambda _: None)
+            monkeypatch.setattr("doedesign.runs.aside._restore", lambda _: None)
             raise Killed
 
     with pytest.raises(Killed):
