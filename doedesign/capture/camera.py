@@ -107,7 +107,7 @@ def depth_range_m(kind: Any) -> tuple[float, float]:
     depth = getattr(kind, "depth_m", None)
     if depth:
         return float(depth[0]), float(depth[1])
-    inner = [depth_range_m(getattr(kind, name)) for name in ("dirt", "raindrop", "fence") if hasattr(kind, name)]
+    inner = [depth_range_m(part) for _, part in kind.parts]
     return min(low for low, _ in inner), max(high for _, high in inner)
 
 

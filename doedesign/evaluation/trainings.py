@@ -22,7 +22,8 @@ from typing import Any, ClassVar
 import jax
 
 from doedesign.design.design import Design
-from doedesign.evaluation.rivals.training import rival_named, rival_options, train_rival
+from doedesign.evaluation.rivals.files import rival_named
+from doedesign.evaluation.rivals.training import rival_options, train_rival
 from doedesign.evaluation.rows import ROBUST, Training
 from doedesign.recon.weights import NETWORK_NAME, read_network
 from doedesign.runs.folder import RELEASED, TRAINING_TABLES, open_run

@@ -187,6 +187,7 @@ def plot_effects(effects: Sequence[Effect], ax: "Axes | None" = None) -> "Figure
     ]
     count = min(_MOST_BARS, max((sum(c.quantity == q for c in worst) for q in quantities), default=1))
     words = "worst colour and depth; every error alone, all others at their mean (the line)"
+    words += "; hatched: beyond the model" if any(math.isinf(_reach(one)) for one in worst) else ""
     sides = ((_LOWER, "lower"), (_HIGHER, "higher"))
     keys = [Line2D([], [], color=hue, lw=5, label=f"one sigma {side}") for hue, side in sides]
     size = (4.4, 1.1 + 0.17 * count)

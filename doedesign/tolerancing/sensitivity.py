@@ -64,7 +64,7 @@ def _variance(low: float | None, expected: float, high: float) -> float:
 def source_shares(effects: Sequence[Effect], quantity: str) -> dict[str, float]:
     """Approximate share of each source in a quantity's variance, if errors do not act together; largest first.
 
-    None where an error leaves the model: nothing is known of what it does, and it may well do the most.
+    Empty where an error leaves the model: nothing is known of what it does, and it may well do the most.
     """
     if any((one.quantity, one.colour) == (quantity, None) and _leaves(one) for one in effects):
         return {}

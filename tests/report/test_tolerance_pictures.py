@@ -1,5 +1,6 @@
 """Pictures of tolerance studies are whole, repeatable, and show what they are given."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -187,3 +188,15 @@ def test_a_budget_out_of_reach_says_what_the_yield_is_without_these_errors():
     assert str(budget("out of reach")) == (
         "without overlay errors the yield is 100.0 % (94.3 to 100.0 %), so no budget gives a yield of 90 %"
     )
+
+
+def test_an_error_that_leaves_the_model_comes_first_and_is_hatched():
+    """Its bars go to the end of the axis, and the note says why."""
+    known = Effect("depth_scale[0]", "depth", "strehl", None, 0.9, 1.0, 0.95, 0.01)
+    beyond = Effect("overlay_x_m[0]", "overlay", "strehl", None, -math.inf, 1.0, -math.inf, math.nan)
+    figure = plot_effects([known, beyond])
+    (axes,) = figure.axes
+    hatched = [bar for bar in axes.patches if isinstance(bar, Rectangle) and bar.get_hatch()]
+    assert len(hatched) == 2
+    assert all(bar.get_x() + bar.get_width() == pytest.approx(axes.get_xlim()[0]) for bar in hatched)
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["overlay x, mask 1", "depth scale, mask 1"]
