@@ -195,6 +195,7 @@ def test_an_error_that_leaves_the_model_comes_first_and_is_hatched():
     known = Effect("depth_scale[0]", "depth", "strehl", None, 0.9, 1.0, 0.95, 0.01)
     beyond = Effect("overlay_x_m[0]", "overlay", "strehl", None, -math.inf, 1.0, -math.inf, math.nan)
     figure = plot_effects([known, beyond])
+    assert isinstance(figure, Figure)
     (axes,) = figure.axes
     hatched = [bar for bar in axes.patches if isinstance(bar, Rectangle) and bar.get_hatch()]
     assert len(hatched) == 2
