@@ -112,20 +112,30 @@ def _until_broken(
     started = {"env": _worker_settings(), "initializer": _begin, "initargs": (os.getpid(), tuple(sys.path))}
     executor = get_reusable_executor(workers, timeout=_IDLE_S, **started)
     flying: dict[Future[Any], str] = {}
+    sent = 0
     try:
         while queue or flying:
             while queue and len(flying) < ahead:
-                flying[executor.submit(_evaluate, work, items[queue[0]])] = queue[0]
+                # Copies of an evaluation may be as large as its networks, so only the first items bring one.
+                told = work if sent < workers else None
+                flying[executor.submit(_evaluate, work.token, told, items[queue[0]])] = queue[0]
                 queue.popleft()
+                sent += 1
             done = wait(flying, return_when=FIRST_COMPLETED).done
             for future in [one for one in flying if one in done]:  # in the order in which they were handed over
-                yield flying[future], named(f"{work.noun} {flying[future]}", future.result)
+                key = flying[future]
+                found = named(f"{work.noun} {key}", future.result)
+                if isinstance(found, _Untold):
+                    flying[executor.submit(_evaluate, work.token, work, items[key])] = key
+                else:
+                    yield key, found
                 del flying[future]
     except TerminatedWorkerError:
         # What was finished just before counts.
         lost = [future for future in flying if not future.done() or future.cancelled() or future.exception()]
-        yield from ((key, future.result()) for future, key in flying.items() if future not in lost)
-        return [flying[future] for future in lost]
+        told = {future: future.result() for future in flying if future not in lost}
+        yield from ((flying[future], found) for future, found in told.items() if not isinstance(found, _Untold))
+        return [key for future, key in flying.items() if future in lost or isinstance(told[future], _Untold)]
     except BaseException:
         executor.shutdown(kill_workers=True)  # nobody waits for what is under way
         raise
@@ -161,6 +171,10 @@ def _worker_settings() -> dict[str, str]:
 _HELD: dict[str, Work] = {}
 
 
+class _Untold:
+    """Answer of a worker that has no copy of the evaluation yet."""
+
+
 def _begin(parent: int, path: tuple[str, ...]) -> None:
     sys.path[:] = path
     # What another worker is just writing cannot be read; it is then compiled here, too.
@@ -175,9 +189,11 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _evaluate(work: Work, item: Any) -> Any:
+def _evaluate(token: str, work: Work | None, item: Any) -> Any:
     # The first copy stands for all that follow it: what it has compiled and computed belongs to it.
-    if work.token not in _HELD:
+    if token not in _HELD:
+        if work is None:
+            return _Untold()
         _HELD.clear()
-        _HELD[work.token] = work
-    return _HELD[work.token](item)
+        _HELD[token] = work
+    return _HELD[token](item)

@@ -21,7 +21,7 @@ from typing import Any, cast
 
 import pytest
 
-from doedesign.runtime.pool import default_workers
+from doedesign.runtime.pool import default_workers, evaluate_here
 from doedesign.tolerancing import studies as studies_module
 from doedesign.tolerancing.pool import BYTES_PER_CELL, DrawModel
 from doedesign.tolerancing.results import tolerance
@@ -85,6 +85,18 @@ def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Stud
         assert row["pid"] != os.getpid()
     assert os.environ.get("OMP_NUM_THREADS") is None  # this process is as it was
     assert {name: vars(main).get(name) for name in ("__file__", "__spec__")} == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_evaluation_is_sent_to_a_worker_once_not_with_every_item(fakes: ModuleType, workers: int):
+    # Networks and PSFs are some 80 MB: sent with every item, a worker grew by as much from item to item.
+    work = fakes.Heavy()
+    found = dict(evaluate_here(work, {str(number): number for number in range(30)}, workers))
+    assert {key: square for key, (square, _) in found.items()} == {str(number): number**2 for number in range(30)}
+    # Whoever is told twice at first, or is busy then, leaves a few more for the other.
+    assert work.sent == 1 if workers == 1 else work.sent <= 10
+    assert len({process for _, process in found.values()}) <= workers
 
 
 @pytest.mark.slow

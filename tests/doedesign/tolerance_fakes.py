@@ -107,6 +107,24 @@ def settings(design: Design, process: Process, variation: Variation) -> list[dic
     return [{"colour": "red", "depth_m": None, "pid": os.getpid(), "main": sys.modules["__main__"].__name__, **found}]
 
 
+class Heavy:
+    """An evaluation that tells its copies' parent how often it was sent off; an item comes back with its worker."""
+
+    noun = "item"
+    token = "heavy"
+
+    def __init__(self) -> None:
+        self.sent = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.sent += 1
+        return {}
+
+    def __call__(self, item: int) -> tuple[int, int]:
+        time.sleep(0.02)
+        return item**2, os.getpid()
+
+
 def marked_rows(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     """Leaves its process id in a file."""
     _mark(design, "plates")
