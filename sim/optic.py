@@ -187,12 +187,17 @@ class ViewedOptic(CellOptic):
     """A DOE whose cells have other values from other depths: what is finer than a cell looks different aslant.
 
     Attributes:
-        transmission: `[view, y, x]` transmission of every cell.
+        transmission: `[view, y, x]` transmission of every cell for light along the axis.
         views: wavelength and depths of sources for which each transmission holds, the farthest of a wavelength first.
     """
 
     transmission: AbstractVar[Complex[Array, "view y x"]]
     views: AbstractVar[tuple[View, ...]]
+
+    @property
+    @abstractmethod
+    def drawn_m(self) -> Float[Array, "v u"]:
+        """Height as drawn, metres, of every cell of the DOE, which may be several here along each axis."""
 
     def view(self, wavelength_m: float, depth_m: float = np.inf) -> int:
         """Which of the views is that from a source depth, or the nearest to it; a ValueError for another wavelength."""
@@ -210,11 +215,21 @@ class ViewedOptic(CellOptic):
         """The path to every cell, and the view from there or from the nearest depth that there is a view for."""
         view = jnp.int32(self.view(line.wavelength_m, depth_m))
         path: Any = super().source(line, depth_m, field_rad)
-        return ViewedSource(path, view)
+        if not any(field_rad):
+            return ViewedSource(path, view)
+        aslant, straight = (self.camera.waves_per_metre(line.wavelength_m, field) for field in (field_rad, ON_AXIS))
+        return ViewedSource(path, view, jnp.float32(aslant - straight))
 
     def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
-        """Transmission in the source's view."""
-        return None, self.transmission[source.view]
+        """Transmission in the source's view.
+
+        From a field angle glass delays light more. What errors and walls add to that is a few per cent of it.
+        """
+        seen = self.transmission[source.view]
+        if source.more_waves_per_metre is None:
+            return None, seen
+        waves, parts = self.drawn_m * source.more_waves_per_metre, seen.shape[0] // self.drawn_m.shape[0]
+        return None, seen * cis(waves.repeat(parts, axis=0).repeat(parts, axis=1))
 
     def from_afar(self, wavelengths_m: Sequence[float]) -> Complex[Array, "w y x"]:
         """Transmission for the farthest depths, at some of the wavelengths."""

@@ -210,10 +210,14 @@ class View(NamedTuple):
 
 
 class ViewedSource(eqx.Module):
-    """A point source, and by its number how a DOE looks from there (`sim.optic.ViewedOptic.views`)."""
+    """A point source, and by its number how a DOE looks from there (`sim.optic.ViewedOptic.views`).
+
+    Besides, how many waves per metre of height its chief ray is delayed more than one on the axis; None on the axis.
+    """
 
     path: SourceMap | SeparableSource | LitSource
     view: Int[Array, ""]
+    more_waves_per_metre: Float[Array, ""] | None = None
 
     def over(self, grid: Grid) -> tuple[Any, Any]:
         """The same as of its path."""

@@ -75,6 +75,11 @@ class EdgeOptic(ViewedOptic):
     source_kind: type[SourceMap] | type[SeparableSource] = eqx.field(static=True, default=SourceMap)
 
     @property
+    def drawn_m(self) -> Float[Array, "v u"]:
+        """The heights."""
+        return self.height_m
+
+    @property
     def means(self) -> Complex[Array, "w y x"]:
         """The transmission from afar: weights of a line sum to its light."""
         return self.from_afar(self.wavelengths_m)

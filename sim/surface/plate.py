@@ -48,6 +48,8 @@ class FabricatedDoe(ViewedOptic):
         means: `[wavelength, y, x]` mean transmission of every cell without the chrome, for overlaps with other DOEs;
             where the plate is not as drawn 0 far under it.
         wavelengths_m: vacuum wavelengths, metres.
+        level: `[y, x]` level number of every cell of the DOE as drawn.
+        level_m: height of every level, metres, as drawn.
         height_m: `[y, x]` height, metres, of every cell of a DOE exactly as drawn, whose PSFs are those of its height
             map, bit for bit; otherwise None.
         source_kind: how sources are described.
@@ -59,6 +61,8 @@ class FabricatedDoe(ViewedOptic):
     views: tuple[View, ...] = eqx.field(static=True)
     means: Complex[Array, "w y x"]
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
+    level: UInt8[Array, "v u"]
+    level_m: Float[Array, " level"]
     height_m: Float[Array, "y x"] | None = None
     source_kind: type[SourceMap] = eqx.field(static=True, default=SourceMap)
 
@@ -66,6 +70,11 @@ class FabricatedDoe(ViewedOptic):
     def grid(self) -> Grid:
         """The cells."""
         return self.camera.grid
+
+    @property
+    def drawn_m(self) -> Float[Array, "v u"]:
+        """Heights as drawn."""
+        return self.level_m[self.level]
 
     def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
         """Heights as drawn, or transmission in the source's view."""
@@ -131,15 +140,16 @@ def as_fabricated(
     traced = is_traced(variation)
     waves = np.array([camera.waves_per_metre(w) for w in lines])
     rates = jnp.asarray(waves, jnp.float32)
+    drawn = jnp.asarray(level_map), jnp.asarray(levels.heights_m(), jnp.float32)
     if not traced and variation.nominal and camera.light == "edges" and not whole_cells:
         height_m = height_of(level_map, levels)
-        return _walled(with_edges(height_m, camera, depths_m=depths_m, wavelengths_m=lines))
+        return _walled(with_edges(height_m, camera, depths_m=depths_m, wavelengths_m=lines), drawn)
     if not traced and variation.nominal and camera.light == "scalar":
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([height_transmission(height, rate) for rate in rates])
         coverage = jnp.asarray(open_cells(camera.grid, camera.opening))
         views = tuple(View(wavelength, 0.0, np.inf) for wavelength in lines)
-        return FabricatedDoe(camera, coverage, coverage * flat, views, flat, lines, height)
+        return FabricatedDoe(camera, coverage, coverage * flat, views, flat, lines, *drawn, height)
     if not traced:
         require_possible(camera.grid, process, variation)
     plan, views = plan_of(camera, process, variation, lines, (min(depths_m), max(depths_m)), traced, whole_cells)
@@ -169,7 +179,7 @@ def as_fabricated(
     opening = Opening(centre, outline_of(camera.opening, variation.chrome_diameter_m))
     maps = CellMaps(packed, widths, rough, coverage)
     transmission, means = transmission_of(plan, (along_y, along_x), maps, relief, rates, left, opening)
-    found = FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
+    found = FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines, *drawn)
     if camera.light == "scalar":
         return found
     # Lines of light have no mean within a cell.
@@ -197,10 +207,10 @@ def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
     return HEADROOM * usual * max(1, int(np.ceil(made / usual / HEADROOM)))
 
 
-def _walled(optic: EdgeOptic) -> FabricatedDoe:
-    """A DOE as drawn, with its light of walls."""
+def _walled(optic: EdgeOptic, drawn: tuple[Array, Array]) -> FabricatedDoe:
+    """A DOE as drawn, levels and their heights, with its light of walls."""
     light = optic.coverage * optic.transmission
-    return FabricatedDoe(optic.camera, optic.coverage, light, optic.views, optic.means, optic.wavelengths_m)
+    return FabricatedDoe(optic.camera, optic.coverage, light, optic.views, optic.means, optic.wavelengths_m, *drawn)
 
 
 def drawn_alike(
@@ -224,7 +234,8 @@ def drawn_alike(
     grid = _parted(camera.grid, plan.parts)
     coverage = jnp.asarray(open_cells(grid, camera.opening))
     transmission = coverage * means[np.array([number for number, _ in plan.views])]
-    return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, drawn.wavelengths_m)
+    same = drawn.wavelengths_m, drawn.level, drawn.level_m
+    return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, *same)
 
 
 def _parted(grid: Grid, parts: int) -> Grid:
