@@ -153,7 +153,7 @@ class CellOptic(CameraOptic):
             )
         if propagation not in get_args(Propagation):
             raise ValueError(f"`propagation` must be one of {get_args(Propagation)}, but got {propagation!r}")
-        return plan_direct(self.camera, line.wavelength_m, propagation)
+        return plan_direct(self.camera, line.wavelength_m, propagation, depth_m=depth_m)
 
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> CellSource:
         """The path to every cell, and the beam on it; the window follows the chief ray."""

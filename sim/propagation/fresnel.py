@@ -12,6 +12,7 @@ it is how light gets to a sensor too near for the far field, cells then being sq
 from typing import Literal, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
@@ -21,7 +22,7 @@ from fab.aperture import RoundAperture
 from fab.errors import InputError
 from sim.camera import Camera
 from sim.propagation.pixel import Banded, pixel_weights
-from sim.propagation.pupil import PupilRows, cis
+from sim.propagation.pupil import DoeRows, PupilRows, SourceColumns, cis
 from sim.source import wrapped_waves
 
 Kernel = Literal["fresnel", "angular_spectrum"]
@@ -42,7 +43,8 @@ class DirectPath(eqx.Module):
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
         """Energy in every pixel of the window, per unit power on the clear aperture; see `FarField.energy`."""
         field = pupil(rows, shared) * self.lens
-        field = jnp.repeat(jnp.repeat(field, self.parts, axis=0), self.parts, axis=1)
+        if self.parts > 1:
+            field = _in_parts(field, self._incident(rows, shared), self.parts)
         spectrum = jnp.fft.fft2(field, self.kernel.shape) * self.kernel
         (y, x), (first_y, first_x) = self.gather, self.first
         # Samples per axis that the pixels use.
@@ -50,14 +52,45 @@ class DirectPath(eqx.Module):
         intensity = image.real**2 + image.imag**2
         return y(x(intensity).T).T
 
+    def _incident(self, rows: DoeRows, shared: SourceColumns) -> Complex[Array, "y x"]:
+        """The wave that lights the cells, through the lens, of any amplitude."""
+        wave = cis(shared.waves(rows.source, None)) * self.lens
+        return wave if rows.light is None else wave * rows.light
+
+
+def _in_parts(field: Complex[Array, "y x"], incident: Complex[Array, "y x"], parts: int) -> Complex[Array, "fy fx"]:
+    """The field of `parts` by `parts` samples of every cell, over which the incident wave goes on as to its neighbours.
+
+    Held at its value in the middle, the wave of a near source would be a staircase: for half a wave per cell at the rim
+    a third of the light went astray.
+    """
+    offset = (np.arange(parts) + 0.5) / parts - 0.5
+    along_y, along_x = (_waves_per_cell(incident, axis)[:, None, :, None] for axis in (0, 1))
+    whole = field[:, None, :, None] * cis(along_y * offset[:, None, None] + along_x * offset)
+    return whole.reshape(field.shape[0] * parts, field.shape[1] * parts)
+
+
+def _waves_per_cell(incident: Complex[Array, "y x"], axis: int) -> Float[Array, "y x"]:
+    """How much a wave turns from cell to cell: the mean of the steps to both neighbours."""
+    count = incident.shape[axis]
+    before, behind = (jax.lax.slice_in_dim(incident, k, count - 1 + k, axis=axis) for k in (0, 1))
+    step = jnp.angle(behind * jnp.conj(before)) / (2 * np.pi)
+    padded = [(1, 1) if axis == other else (0, 0) for other in (0, 1)]
+    steps = jnp.pad(step, padded, mode="edge")
+    return (jax.lax.slice_in_dim(steps, 0, count, axis=axis) + jax.lax.slice_in_dim(steps, 1, None, axis=axis)) / 2
+
 
 def nyquist_focal_length_m(cells: int, pitch_m: float, wavelength_m: float) -> float:
     """Shortest focal length whose lens phase N cells of that pitch can sample, N pitch^2 / lambda (eq. 6), metres."""
     return cells * pitch_m**2 / wavelength_m
 
 
-def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_spectrum") -> DirectPath:
+def plan_direct(
+    camera: Camera, wavelength_m: float, kernel: Kernel = "angular_spectrum", *, depth_m: float = np.inf
+) -> DirectPath:
     """Prepare the direct path of one wavelength; phases are formed in float64 and wrapped before float32.
+
+    It serves sources at every depth; without a lens those at `depth_m` (metres) and beyond to the accuracy below.
 
     The lens is the thin one of eq. 5, which has a mapping of its own: near that of tangents, with aberrations of the
     order of angle⁴. An InputError for a camera that asks for another, where eq. 6 does not hold, or where the window
@@ -79,7 +112,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
             'Use the "far_field" path.',
         )
         raise InputError("camera.mapping", rule, camera.lens_text, cure)
-    parts = _parts(camera, wavelength_m)
+    parts = _parts(camera, wavelength_m, depth_m)
     cells, pitch, distance = max(camera.grid.shape), camera.grid.pitch_m, camera.sensor_distance_m
     nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m) if camera.distance_m is None else 0.0
     if nyquist > camera.focal_length_m * (1 + 1e-9):
@@ -125,14 +158,20 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     )
 
 
-def _parts(camera: Camera, wavelength_m: float) -> int:
-    """Samples per cell and axis that carry light from one rim to the far corner of the window; one behind a lens."""
+def _parts(camera: Camera, wavelength_m: float, depth_m: float) -> int:
+    """Samples per cell and axis that carry light from one rim to the far corner of the window; one behind a lens.
+
+    A sample is a square that is lit evenly, so a wave from a near source must turn little over it: an eighth of a wave
+    at the rim leaves 1 % of the light there.
+    """
     if camera.distance_m is None:
         return 1
+    bend = abs(camera.beam_curvature_per_m(wavelength_m)) + (0.0 if np.isinf(depth_m) else 1 / depth_m)
+    turned = 8 * camera.grid.pitch_m * camera.opening.reach_m * bend / wavelength_m
     across = camera.opening.reach_m + camera.window * camera.pixel_m / np.sqrt(2)
     sine = across / np.hypot(across, camera.distance_m)
     # Intensity has twice the band of the field.
-    return max(1, int(np.ceil(4 * camera.grid.pitch_m * sine / wavelength_m)))
+    return max(1, int(np.ceil(4 * camera.grid.pitch_m * sine / wavelength_m)), int(np.ceil(turned)))
 
 
 def _kernel(

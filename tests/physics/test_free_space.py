@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fab.aperture import RectangularAperture
 from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
+from sim.illumination import EvenBeam
 from sim.metrics import energy_budget
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
@@ -85,6 +87,21 @@ def test_light_is_that_of_rayleigh_and_sommerfeld(distance_m: float, way: str, k
     direct *= camera.pixel_m**2 / (np.pi * camera.aperture_m**2 / 4) * camera.transmission(WAVE)
     found = image[np.ix_(rows, rows)].ravel()
     assert np.linalg.norm(found - direct) < 0.01 * np.linalg.norm(direct)
+
+
+@pytest.mark.parametrize(("from_m", "as_beam"), [(1.5e-3, True), (1.5e-3, False), (6e-3, False)])
+def test_a_near_point_lights_cells_as_it_lights_parts_of_them(from_m: float, as_beam: bool):
+    """Up to 0.4 waves per cell at the rim, which goes on within the cell: the same relief on cells of a fourth."""
+    relief = 100e-9 * np.random.default_rng(2).integers(0, 8, (64, 64))
+    found = []
+    for parts in (1, 4):
+        beam, depth = (EvenBeam(from_m), np.inf) if as_beam else (None, from_m)
+        grid, aperture = Grid((64 * parts, 64 * parts), PITCH / parts), RectangularAperture((256e-6, 256e-6))
+        camera = replace(CAMERA, grid=grid, aperture=aperture, pixel_m=4e-6, window=64, beam=beam)
+        height = np.kron(relief, np.ones((parts, parts)))
+        found.append(np.asarray(psf(height, camera, [depth]).energy[0, 0], np.float64))
+    # An eighth of a wave across a sample at the rim. With cells lit evenly 0.05 and 0.46.
+    assert np.linalg.norm(found[0] - found[1]) < 0.01 * np.linalg.norm(found[1])
 
 
 def test_a_lens_focuses_into_its_airy_disc():
