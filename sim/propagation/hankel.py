@@ -9,6 +9,7 @@ interpolation of the complex field to eight times finer radii; integration over 
 pixel's area as a function of radius. Only one octant of the window is distinct.
 """
 
+import math
 from functools import lru_cache
 
 import equinox as eqx
@@ -28,7 +29,8 @@ _OVERSAMPLING = 2.2  # radii per lambda d / D; the field's band needs 1
 _REFINEMENT = 8  # fine radii per coarse radius; intensity is then linear between them to 1e-3
 _HALF_TAPS = 8  # one-sided length of the interpolation kernel
 _SUBRINGS = 3  # a 5 cm source turns by 0.15 waves across an outermost ring of the paper's plate
-_POINTS = 16  # per pixel and axis, for the areas
+_POINTS = 16  # least per pixel and axis, for the areas
+_CHUNK = 2**21  # points worked on at once
 
 
 class Hankel(eqx.Module):
@@ -93,47 +95,76 @@ def _sine_radius_m(camera: Camera, place_m: Float[np.ndarray, "*s"]) -> tuple[np
     if camera.is_sine:
         return place_m, 1.0
 
-    def radius(place_m: np.ndarray) -> np.ndarray:
-        return camera.sensor_distance_m * camera.sines_of(np.zeros_like(place_m), place_m)[1]
-
     step_m = 1e-4 * camera.pixel_m
-    slope = (radius(place_m + step_m) - radius(place_m - step_m)) / (2 * step_m)
-    return radius(place_m), slope * radius(place_m) / place_m
+    slope = (_sine_place_m(camera, place_m + step_m) - _sine_place_m(camera, place_m - step_m)) / (2 * step_m)
+    radius_m = _sine_place_m(camera, place_m)
+    return radius_m, slope * radius_m / place_m
 
 
-def _pixel_areas(camera: Camera, fine_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First fine radius, weights per fine radius, and the map to distinct pixels."""
-    n = camera.window
+def _sine_place_m(camera: Camera, place_m: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
+    return camera.sensor_distance_m * camera.sines_of(np.zeros_like(place_m), place_m)[1]
+
+
+def _points(camera: Camera, airy_m: float) -> int:
+    """Points per pixel and axis: two per lambda d / D, which no fringe of the intensity is finer than, or more.
+
+    The number is even, so none lies on the axis. `airy_m` is lambda d / D.
+    """
+    stretch = 1.0
+    if not camera.is_sine:  # how much finer fringes are at places on the sensor than of a lens that images sines
+        place_m = np.linspace(0.0, camera.window * camera.pixel_m / np.sqrt(2), 257)
+        stretch = float(np.max(np.diff(_sine_place_m(camera, place_m)) / np.diff(place_m)))
+    return max(_POINTS, 2 * math.ceil(stretch * camera.pixel_m * camera.fill / airy_m - 1e-9))
+
+
+def _pixel_areas(camera: Camera, fine_m: float, airy_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First fine radius, weights per fine radius, and the map to distinct pixels; `airy_m` is lambda d / D."""
+    n, points = camera.window, _points(camera, airy_m)
     steps = np.abs(2 * np.arange(n) - (n - 1))  # distance from the axis in half pixels
     low, high = np.minimum(steps[:, None], steps[None, :]), np.maximum(steps[:, None], steps[None, :])
     keys, distinct = np.unique(high * (n + 1) + low, return_inverse=True)
     far, near = (keys // (n + 1)) * camera.pixel_m / 2, (keys % (n + 1)) * camera.pixel_m / 2
-    offsets = Grid((_POINTS, _POINTS), camera.pixel_m * camera.fill / _POINTS).axis_m("x")
-    place_m = np.hypot(far[:, None, None] + offsets[:, None], near[:, None, None] + offsets).reshape(len(keys), -1)
+    offsets = Grid((points, points), camera.pixel_m * camera.fill / points).axis_m("x")
+    area = (camera.pixel_m * camera.fill) ** 2 / points**2
+    firsts, parts = [], []
+    at_once = max(1, _CHUNK // points**2)
+    for start in range(0, len(keys), at_once):
+        some = slice(start, start + at_once)
+        place_m = np.hypot(far[some, None, None] + offsets[:, None], near[some, None, None] + offsets)
+        first, areas = _areas_of(camera, place_m.reshape(place_m.shape[0], -1), fine_m)
+        firsts.append(first)
+        parts.append(areas * area)
+    width = max(part.shape[1] for part in parts)
+    padded = [np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
+    return np.concatenate(firsts), np.concatenate(padded), distinct.reshape(n, n)
+
+
+def _areas_of(
+    camera: Camera, place_m: Float[np.ndarray, "distinct point"], fine_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """First fine radius of some pixels, and how many of their points each fine radius from there on stands for."""
     radius_m, share = _sine_radius_m(camera, place_m)
     if camera.in_angles:  # there is no light beyond a sine of 1
         share = share * (radius_m <= 1)
     radius = radius_m / fine_m
     index = np.floor(radius).astype(np.int64)
     first = index.min(axis=1)
-    width = int((index.max(axis=1) - first).max()) + 2
-    slot = (index - first[:, None]) + np.arange(len(keys))[:, None] * width
+    width, count = int((index.max(axis=1) - first).max()) + 2, len(place_m)
+    slot = (index - first[:, None]) + np.arange(count)[:, None] * width
     right = radius - index
-    areas = np.bincount(slot.ravel(), (share * (1 - right)).ravel(), minlength=len(keys) * width)
-    areas += np.bincount(slot.ravel() + 1, (share * right).ravel(), minlength=len(keys) * width + 1)[
-        : len(keys) * width
-    ]
-    area = (camera.pixel_m * camera.fill) ** 2 / _POINTS**2
-    return first, areas.reshape(len(keys), width) * area, distinct.reshape(n, n)
+    areas = np.bincount(slot.ravel(), (share * (1 - right)).ravel(), minlength=count * width)
+    areas += np.bincount(slot.ravel() + 1, (share * right).ravel(), minlength=count * width + 1)[: count * width]
+    return first, areas.reshape(count, width)
 
 
 @lru_cache(maxsize=8)
 def plan_hankel(camera: Camera, wavelength_m: float) -> Hankel:
     """Prepare the Hankel transform of one wavelength; matrices are built in float64. Kept, for all depths."""
     scale = wavelength_m * camera.sensor_distance_m
-    coarse_m = scale / camera.aperture_m / _OVERSAMPLING
+    airy_m = scale / camera.aperture_m
+    coarse_m = airy_m / _OVERSAMPLING
     edges = _subring_edges_m(camera)
-    first, areas, distinct = _pixel_areas(camera, coarse_m / _REFINEMENT)
+    first, areas, distinct = _pixel_areas(camera, coarse_m / _REFINEMENT, airy_m)
     fine_needed = int((first + areas.shape[1]).max()) + 1
     coarse = -(-fine_needed // _REFINEMENT) + 2 * _HALF_TAPS
     rate = 2 * np.pi * np.abs(np.arange(coarse) - _HALF_TAPS) * coarse_m / scale

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ from scipy.special import j0, j1
 
 from bench.reference import YELLOW_M, make_camera, relative_error
 from fab.grid import Grid
-from sim.propagation.hankel import plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
+from sim.propagation.hankel import _points, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 
 CAMERA = make_camera(300, 0.6e-3, 1.08e-3, 1.85e-6, 49)
 
@@ -54,6 +56,27 @@ def test_an_open_aperture_is_the_airy_disc():
     density = np.pi / 4 * (CAMERA.aperture_m / (YELLOW_M * CAMERA.focal_length_m)) ** 2 * (2 * j1(v) / v) ** 2
     wanted = density.reshape(49, 40, 49, 40).mean(axis=(1, 3)) * CAMERA.pixel_m**2
     assert relative_error(got, wanted) < 3e-3  # as above
+
+
+@pytest.mark.parametrize("airy_radii", [10, 18.6, 40])
+def test_a_pixel_much_wider_than_the_airy_disc_has_all_of_its_light(airy_radii: float):
+    """One pixel about the axis: the light of the Airy pattern in a square `airy_radii` times lambda f / D wide."""
+    camera = make_camera(256, 0.512e-3, 1e-3, airy_radii * YELLOW_M * 1e-3 / 0.512e-3, 1)
+    source = jnp.asarray(ring_source_waves(camera, np.inf, YELLOW_M))
+    got = plan_hankel(camera, YELLOW_M).energy(jnp.zeros(ring_count(camera)), source, jnp.float32(1.0))
+    points = (np.arange(1000) + 0.5) / 1000 * airy_radii / 2  # a quarter of the square, 25 or more per lambda f / D
+    v = np.pi * np.hypot(points[:, None], points)
+    wanted = np.mean(np.pi / 4 * (2 * j1(v) / v) ** 2) * airy_radii**2
+    assert float(got[0, 0]) == pytest.approx(wanted, rel=2e-3)  # linear interpolation between fine radii
+
+
+def test_distortion_that_draws_the_image_together_has_more_points_in_a_pixel():
+    sine, airy_m = 0.45, YELLOW_M * 1e-3 / 20e-6
+    pixel_m = np.sqrt(2) * (sine - 0.3 * sine**3) * 1e-3  # its corners have light of that sine
+    wide = make_camera(20, 20e-6, 1e-3, float(pixel_m), 1)
+    assert _points(wide, airy_m) == 2 * np.ceil(pixel_m / airy_m)
+    drawn = pixel_m / airy_m / (1 - 0.9 * sine**2)  # by the slope of the distortion there
+    assert _points(replace(wide, distortion=(-0.3, 0.0)), airy_m) == pytest.approx(2 * drawn, abs=2)
 
 
 @pytest.mark.parametrize("depth_m", [np.inf, 0.02])
