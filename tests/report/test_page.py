@@ -160,6 +160,27 @@ def test_what_an_objective_keeps_from_below_is_marked(run: Path, name: str, quan
 
 
 @pytest.mark.parametrize(
+    ("over", "value", "text", "state"),
+    [
+        ((1.0, 1.0, 1.0), 1.0, "100.00 %", ""),
+        ((1.0, None, None), 3.0, "2 of 3 beyond 400 %, others 100.00 %", "missed"),
+        ((1.0, 1.5, None), 6.5 / 3, "1 of 3 beyond 400 %, others 125.00 % (100.00 % to 150.00 %)", "missed"),
+        ((None, None), 4.0, "2 of 2 beyond 400 %", "missed"),
+    ],
+)
+def test_foci_too_wide_to_have_a_width_are_told(
+    run: Path, over: tuple[float | None, ...], value: float, text: str, state: str
+):
+    wanted = {"width_wanted_m": 1e-5, "strength": 0.5, "share": 0.5}
+    widths = [None if one is None else 1e-5 * one for one in over]
+    foci = [{"width_x_m": width, "width_y_m": 1e-5, **wanted} for width in widths]
+    block = asked_block(open_files(run), {"focus": {"foci": foci}})
+    assert block is not None
+    bar = next(bar for bar in block.bars if bar.label.startswith("width of the foci"))
+    assert (bar.value, bar.text, bar.state) == (pytest.approx(value), text, state)
+
+
+@pytest.mark.parametrize(
     ("wanted", "title"), [(True, "0th order (one of the spots)"), (False, "0th order"), (None, "0th order")]
 )
 def test_a_zeroth_order_that_is_a_spot_is_told_as_one(run: Path, wanted: bool | None, title: str):

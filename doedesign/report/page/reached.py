@@ -10,6 +10,8 @@ from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
 
 Rows = Sequence[Mapping[str, Any]]
 
+_WIDEST = 4.0  # width of a focus, over that wanted, up to which it is known (`doedesign.focus.depth`)
+
 
 def reached_section(files: RunFiles, metrics: Mapping[str, Any], history: Rows) -> PageSection | None:
     """The first part of a page.
@@ -69,21 +71,26 @@ def _aims(metrics: Mapping[str, Any]) -> Iterator[Bar | None]:
         yield _bar(f"light on the area{where}", [area["on_target"]], "on_target")
         yield _bar(f"contrast of the area{where}", [area["contrast"]], "contrast")
     if focus := metrics.get("focus"):
-        widths = [
-            max(one["width_x_m"], one["width_y_m"]) / one["width_wanted_m"]
-            for one in focus["foci"]
-            if one["width_x_m"] and one["width_y_m"]
-        ]
-        end = 1.15 * max([1.0, *widths])
-        yield _bar(
-            "width of the foci over that wanted", widths, "focus_width", end=end, mark=1.0, mark_text="wanted 100 %"
-        )
+        yield _focus_widths(focus["foci"])
         yield _bar("Strehl ratio on the axis", [one["strength"] for one in focus["foci"]], "strehl", end=1.0)
         yield _bar("light in the foci", [one["share"] for one in focus["foci"]], "on_target")
     for pattern in metrics.get("patterns") or []:
         where = f", {pattern['colour']}" if "colour" in pattern else ""
         yield _bar(f"light on the pattern{where}", [pattern["on_target"]], "on_target")
         yield _bar(f"uniformity of the pattern{where}", [pattern["uniformity"]], "strehl", end=1.0)
+
+
+def _focus_widths(foci: Rows) -> Bar | None:
+    """The bar of how wide foci are over what is wanted; those that have no width count as the widest that has one."""
+    sides = [(one["width_x_m"], one["width_y_m"], one["width_wanted_m"]) for one in foci]
+    widths = [None if x is None or y is None else max(x, y) / wanted for x, y, wanted in sides]
+    filled = [_WIDEST if width is None else width for width in widths]
+    label, name, end = "width of the foci over that wanted", "focus_width", 1.15 * max([1.0, *filled])
+    bar, others = _bar(label, filled, name, end=end, mark=1.0, mark_text="wanted 100 %"), _bar(label, widths, name)
+    if bar is None or None not in widths:
+        return bar
+    text = f"{widths.count(None)} of {len(foci)} beyond {100 * _WIDEST:g} %"
+    return bar._replace(text=f"{text}, others {others.text}" if others else text, state="missed")
 
 
 def _plates(files: RunFiles, metrics: Mapping[str, Any]) -> Iterator[Bar | None]:
