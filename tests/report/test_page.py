@@ -1,10 +1,12 @@
 """The page of a run: what it gathers, when a part appears, and what it refuses."""
 
+import base64
 import csv
 import json
 import math
 import re
 import shutil
+import zlib
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from doedesign.report.page.blocks import (
 from doedesign.report.page.compare import compared
 from doedesign.report.page.files import open_files, picture_image, safe_json
 from doedesign.report.page.gather import gather
+from doedesign.report.page.maps import height_block
 from doedesign.report.page.numbers import LABELS, SHARES
 from doedesign.report.page.reached import asked_block, reached_section
 from doedesign.report.page.write import watch_report
@@ -37,7 +40,9 @@ from doedesign.runs.results import results_folder
 from doedesign.spec.models import ObjectiveSpec
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file
-from fab.level_map import read_level_map
+from fab.grid import Grid
+from fab.level_map import LevelMap, read_level_map
+from fab.levels import Levels
 from fab.order.write import write_order
 from sim.metrics import METRICS
 from sim.store import read_stored_bank, write_bank
@@ -543,6 +548,19 @@ def test_tiles_cover_maps_of_any_shape():
             assert mean.shape == tiles.reduced_shape(shape, factor)
             np.testing.assert_allclose(mean, 1.0)
         assert all(re.fullmatch(r"\d+x\d+", name) for name in heads)
+
+
+def test_reduced_copies_of_a_map_begin_at_its_top_row():
+    """Rows 38 and 39 from the top of 1025 are row 19 of halves and row 9 of quarters, wherever the padding lies."""
+    level = np.zeros((1025, 100), np.uint8)
+    level[::-1][38:40] = 3
+    level_map = LevelMap(level, Levels(4, 300e-9), Grid(level.shape, 1e-6), math.inf)
+    data = height_block("heights", level_map).data
+    assert data["reductions"] == [1, 2, 4]
+    for factor, row in ((2, 19), (4, 9)):
+        tile = zlib.decompress(base64.b64decode(data["views"][0]["reduced"][str(factor)][0][0])[8:-4])
+        numbers = np.frombuffer(tile, np.uint8).reshape(-1, 100 // factor + 1)
+        assert np.flatnonzero((numbers != numbers[0]).any(axis=1)).tolist() == [row]
 
 
 def test_digests_of_results_are_told(run: Path):

@@ -145,9 +145,9 @@ def _map_data(level_map: LevelMap, numbers: NDArray[np.uint8], views: Sequence[M
     """Pyramid of a raster, whose numbers of colours are shared by all views."""
     grid = level_map.grid
     factors = tiles.reductions_of(grid.shape)
-    inside = level_map.relief.inside(grid)
+    inside = level_map.relief.inside(grid)[::-1]  # from the top, where the squares of reductions begin, too
     covered = dict(tiles.reduced(inside, factors))
-    whole = np.where(inside, numbers, np.uint8(_OUTSIDE))[::-1]
+    whole = np.where(inside, numbers[::-1], np.uint8(_OUTSIDE))
     return {
         "width": grid.shape[1],
         "height": grid.shape[0],
@@ -161,7 +161,7 @@ def _map_data(level_map: LevelMap, numbers: NDArray[np.uint8], views: Sequence[M
                 "name": view.name,
                 "colours": tiles.palette(_with_chrome(view.colours)),
                 "shades": tiles.palette(_with_chrome(view.shades)),
-                "reduced": _reduced_tiles(view.mean, inside, covered, factors),
+                "reduced": _reduced_tiles(view.mean[::-1], inside, covered, factors),
             }
             for view in views
         ],
@@ -206,12 +206,12 @@ def _reduced_tiles(
     covered: Mapping[int, NDArray[np.float32]],
     factors: tuple[int, ...],
 ) -> dict[str, list[list[str]]]:
-    """Tiles of the means of values from 0 to 1 over the relief, for every reduction."""
+    """Tiles of the means of values from 0 to 1 over the relief, for every reduction; first rows are on top."""
     found = {}
     for factor, mean in tiles.reduced(np.where(inside, values, 0), factors):
         share = covered[factor]
         shades = np.rint(np.clip(mean / np.maximum(share, 1e-3), 0, 1) * (_SHADES - 1)).astype(np.uint8)
-        shown = np.where(share >= 0.5, shades, np.uint8(_OUTSIDE))[::-1]
+        shown = np.where(share >= 0.5, shades, np.uint8(_OUTSIDE))
         found[str(factor)] = tiles.tile_rows(np.ascontiguousarray(shown))
     return found
 
