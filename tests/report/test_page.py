@@ -533,6 +533,25 @@ def test_runs_side_by_side(run: Path, tmp_path: Path):
     assert "--watch" in told
 
 
+def test_of_several_areas_the_worst_is_compared(run: Path, tmp_path: Path):
+    one = {"on_target": 0.5, "contrast": 0.1, "zeroth_order": 0.01, "side_lobe": 1.0}
+    own = {"one": one, "two": [one, {**one, "on_target": 0.4, "contrast": 0.2, "zeroth_order": 0.0}]}
+    for name, area in own.items():
+        shutil.copytree(run, tmp_path / name)
+        path, manifest = tmp_path / name / "metrics.json", tmp_path / name / MANIFEST_NAME
+        path.write_bytes(canonical_json({**json.loads(path.read_text()), "area": area}))
+        record = json.loads(manifest.read_text())
+        record["results_sha256"]["metrics.json"] = sha256_file(path)
+        manifest.write_bytes(canonical_json(record))
+    content = compared([tmp_path / "one", tmp_path / "two"])
+    table = next(block for block in blocks(content, TableBlock) if block.title == "What is aimed at")
+    assert [row[:3] for row in table.rows] == [
+        ("contrast, worst area", "10.00 %", "20.00 %"),
+        ("light on the target, worst area", "50.00 %", "40.00 %"),
+        ("0th order, worst area", "1.00 %", "1.00 %"),
+    ]
+
+
 def test_tiles_cover_maps_of_any_shape():
     """Every pixel lies in one tile, and sizes of all tiles have heads."""
     for shape in ((1, 1), (512, 512), (513, 512), (1030, 2049)):

@@ -109,17 +109,26 @@ def _means(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, float | None], 
 
 
 def _aims(names: Sequence[str], metrics: Sequence[Mapping[str, Any]]) -> TableBlock | None:
-    """Numbers of spots and foci that all runs have."""
+    """Numbers of spots, areas and foci that all runs have."""
     rows = []
     for table in ("orders", "area", "focus"):
-        own = [one.get(table) for one in metrics]
+        found = [one.get(table) for one in metrics]
+        own = [_worst(one) if isinstance(one, list) else one for one in found]
+        which = ", worst area" if any(isinstance(one, list) for one in found) else ""
         if not all(isinstance(one, Mapping) for one in own):
             continue
         for key, value in own[0].items():  # type: ignore[union-attr]
             values = [one.get(key) for one in own]  # type: ignore[union-attr]
             if isinstance(value, float) and all(isinstance(one, float) for one in values):
-                rows.append((label_of(key), *_row(key, values)))
+                rows.append((label_of(key) + which, *_row(key, values)))
     return TableBlock("What is aimed at", ("number", *_columns(names)), tuple(rows)) if rows else None
+
+
+def _worst(areas: Sequence[Mapping[str, Any]]) -> Mapping[str, float]:
+    """Numbers of the worst of several areas, each of its own."""
+    sides = {"on_target": min, "contrast": max, "zeroth_order": max}
+    shared = [key for key in sides if areas and all(key in one for one in areas)]
+    return {key: sides[key](one[key] for one in areas) for key in shared}
 
 
 def _tolerances(names: Sequence[str], runs: Sequence[RunFiles]) -> TableBlock | None:
