@@ -236,13 +236,14 @@ def masks(
     from doedesign.runs.costs import measured
     from fab.order.formats import Formats
 
+    probe_m = length_of("--probe", probe)
     with measured(source if source.is_dir() else None, "masks", writes=out or Path("masks")) as taken:
         done = write_masks(
             source,
             out,
             levels=levels,
             on_violation=on_violation,
-            probe_m=length_of("--probe", probe) or PROBE_M,
+            probe_m=PROBE_M if probe_m is None else probe_m,
             patch=_patch(patch, mesh_patch),
             formats=Formats(plates, combined_gds, mesh_cells),
             overwrite=overwrite,

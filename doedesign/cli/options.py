@@ -66,6 +66,7 @@ _PLACES = {
     "formats: mesh_cells": "--mesh-cells",
     "etch_depths_m": "--etch-depths",
     "pitch_m": "--pitch",
+    "probe_m": "--probe",
     "pixel_m": "--pixel",
     "scale_m": "--scale",
     "aperture_m": "--aperture",

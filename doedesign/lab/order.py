@@ -78,11 +78,13 @@ def write_masks(
             (`doedesign.runs.level_maps.drawing_from`).
 
     Raises:
-        InputError: the map cannot be drawn, the process cannot print it and `on_violation` is "fail", or the folder
-            cannot be written or has the order of another design.
+        InputError: the probe's wavelength is not positive, the map cannot be drawn, the process cannot print it and
+            `on_violation` is "fail", or the folder cannot be written or has the order of another design.
         CheckFailed: what was read back differs from what was asked for; nothing is left behind.
     """
     probe_m = metres(probe_m, "probe_m")
+    if not probe_m > 0:
+        raise InputError("probe_m", "must be positive", f"{probe_m:g} m", 'Give a wavelength, such as "520 nm".')
     level_map, origin, design = drawing_from(source, levels, **geometry)
     spec = None if design is None else design.spec
     run = None if design is None else design.folder

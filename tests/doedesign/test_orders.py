@@ -34,6 +34,12 @@ def order_of(folder: Path, level_map: LevelMap, of: LevelMap | None = None) -> P
     return write_order(folder, level_map, source=ORIGIN | {"level_map_sha256": (of or level_map).digest}).folder
 
 
+@pytest.mark.parametrize("probe", ["0 nm", "-520 nm"])
+def test_a_probe_has_a_wavelength(tmp_path: Path, probe: str):
+    code, _, said = call("masks", tmp_path, f"--probe={probe}")
+    assert (code, said.startswith("doedesign: --probe: must be positive, but got ")) == (2, True)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs of one name, runs/small and runs/coarse, of four levels and of two, and the order of the first."""
