@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from doedesign.cli.closing import words_to_draw
 from doedesign.cli.console import print_paths, print_text, say
-from doedesign.cli.options import AsJson, Flag
+from doedesign.cli.options import AsJson, Flag, refuse_options
 from fab.errors import InputError, printable
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def show(
     Args:
         folder: Run folder, order, or folder of results inside a run.
         what: The most telling picture, all pictures, the masks, the pages for the lab, or all of these.
-        masks: The run's mask order; masks/NAME by default.
+        masks: The run's mask order, for masks, pages or all of it; masks/NAME by default.
         print_: Print the paths and open nothing.
     """
     from doedesign.overview.kinds import record_of
@@ -105,6 +105,8 @@ def show(
     record = record_of(folder)
     found = shown_of(folder, record)
     if record.kind == "run" and what in ("masks", "pages", "all"):
+        if masks is not None and not masks.is_dir():
+            raise InputError("--masks", "must be the folder of a mask order", f"no folder: {masks}", "Check the path.")
         own = own_level_map(folder)
         order = masks or order_of_run(record.name, folder, own)
         another = masks is None and own is not None and order.is_dir() and not is_made_from(order, own)
@@ -115,6 +117,9 @@ def show(
             got = "that of another design" if another else "no folder"
             cure = f"Draw it: doedesign {shlex.join(words_to_draw(record.name, folder))}"
             raise InputError(str(order), "must be the run's mask order", got, cure)
+    else:
+        cure = "Leave it out, or show masks, pages or all of a run."
+        refuse_options(show, {"masks": masks}, "goes with masks, pages or all of a run only", cure)
     pictures = found.pictures[:1] if what == "picture" else found.pictures
     files = [*pictures] * (what in ("picture", "pictures", "all")) + [*found.pages] * (what in ("pages", "all"))
     layout = found.layout if what in ("masks", "all") else ()

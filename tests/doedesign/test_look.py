@@ -71,6 +71,23 @@ def test_the_masks_of_a_run_are_those_of_its_order(viewers: Path, monkeypatch: p
     assert not list(viewers.glob("said*"))
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("{run}", "--masks", EXAMPLE), "--masks: goes with masks, pages or all of a run only"),
+        (("{run}", "pictures", "--masks", "nonsense"), "--masks: goes with masks, pages or all of a run only"),
+        ((EXAMPLE, "masks", "--masks", EXAMPLE), "--masks: goes with masks, pages or all of a run only"),
+        (("{run}", "masks", "--masks", "nonsense"), "--masks: must be the folder of a mask order"),
+        (("{run}", "all", "--masks", "nonsense"), "--masks: must be the folder of a mask order"),
+    ],
+)
+def test_another_order_is_looked_at_or_refused(tmp_path: Path, arguments: tuple[object, ...], words: str):
+    run = written(tmp_path / "run")
+    code, out, said = call("show", *(str(one).format(run=run) for one in arguments), "--print")
+    assert (code, out) == (2, "")
+    assert said.startswith(f"doedesign: {words}, but got ")
+
+
 @pytest.mark.parametrize("missing", ["DISPLAY", "PATH"])
 def test_without_a_display_or_a_viewer_paths_are_printed(viewers: Path, monkeypatch: pytest.MonkeyPatch, missing: str):
     run = written(viewers / "run")
