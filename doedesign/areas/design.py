@@ -20,7 +20,7 @@ from doedesign.areas.target import AreaTarget, camera_for
 from doedesign.areas.transport import transport_phase
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
-from doedesign.design.lbfgs import lbfgs_memory, lbfgs_step
+from doedesign.design.lbfgs import finite_loss, lbfgs_memory, lbfgs_step
 from doedesign.spec import Spec, input_files
 from doedesign.spots.superposition import Staircase
 from fab.errors import InputError
@@ -170,7 +170,11 @@ class AreaTask:
         return "starting from the wave of the area" if given else "carrying the beam to the area by optimal transport"
 
     def steps(self, state: AreaState) -> Iterator[tuple[AreaState, dict[str, Any]]]:
-        """Do the remaining steps one by one; yields the state, and the line of the history."""
+        """Do the remaining steps one by one; yields the state, and the line of the history.
+
+        Raises:
+            InputError: the loss is no longer finite.
+        """
         areas, count = self.spec.areas, self.spec.optimize.steps
         names = [
             f"{name} {i}" if len(areas) > 1 else name for i, _ in enumerate(areas, 1) for name in AreaLight._fields
@@ -182,8 +186,9 @@ class AreaTask:
                 state = self._settle(state, share)
             phase, memory, loss, light = _step(self.problem, state.phase, state.free, state.memory, weights)
             state = AreaState(phase, state.free, memory, step + 1)
+            value = finite_loss(loss, step, 'Choose another area, or area.start = "random".')
             terms = [float(part) for one in light for part in one]
-            yield state, {"step": step, "loss": float(loss), "terms": terms, "names": names}
+            yield state, {"step": step, "loss": value, "terms": terms, "names": names}
 
     def settled(self, step: int) -> float:
         """Distance to the nearest level, over the largest there is, up to which cells are set to it at a step."""

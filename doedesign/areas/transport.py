@@ -7,12 +7,9 @@ less blur (M. Cuturi, Adv. Neural Inf. Process. Syst. 26, 2292, 2013); on two re
 matrix products.
 """
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import zoom
 
 _CELLS = 96  # of either picture, per axis
 _BLURS = (0.3, 0.1, 0.03, 0.01, 0.004, 0.0015)  # squares of the widths of both pictures
@@ -55,12 +52,25 @@ def transport_phase(
 def _coarse(
     picture: Float[np.ndarray, "y x"], axes: tuple[Float[np.ndarray, " y"], Float[np.ndarray, " x"]]
 ) -> tuple[Float[np.ndarray, "v u"], list[np.ndarray]]:
-    """A picture on at most so many cells per axis, its sum 1, and their places."""
-    shape = [min(n, _CELLS) for n in picture.shape]
-    resized: Any = zoom(picture, [m / n for m, n in zip(shape, picture.shape, strict=True)], order=1)
-    smaller = np.maximum(resized, 0)
+    """A picture on at most so many cells per axis, each with all light that falls on it, its sum 1, and their places.
+
+    The outermost cells lie as far out as those of the picture.
+    """
+    rows, columns = (_overlaps(n, min(n, _CELLS)) for n in picture.shape)
+    smaller = rows @ np.maximum(picture, 0) @ columns.T
     places = [np.linspace(axis[0], axis[-1], m) for axis, m in zip(axes, smaller.shape, strict=True)]
     return smaller / smaller.sum(), places
+
+
+def _overlaps(fine: int, coarse: int) -> Float[np.ndarray, "coarse fine"]:
+    """Share of every fine cell that lies on every coarse one, on one axis; the middles of those at its ends agree."""
+    if fine == coarse:
+        return np.eye(fine)
+    wide = (fine - 1) / (coarse - 1)  # a coarse cell, in fine ones
+    ends = (np.arange(1, coarse) - 0.5) * wide + 0.5  # between coarse cells, from the edge of the first fine one
+    edges = np.concatenate([[0.0], ends, [float(fine)]])
+    first, cells = np.maximum(edges[:-1, None], np.arange(fine)), np.arange(1, fine + 1)
+    return np.maximum(np.minimum(edges[1:, None], cells) - first, 0.0)
 
 
 def _potential(

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
-from doedesign.design.lbfgs import lbfgs_memory, lbfgs_step
+from doedesign.design.lbfgs import finite_loss, lbfgs_memory, lbfgs_step
 from doedesign.focus.foci import Foci
 from doedesign.focus.problem import FINER, FocusLight, FocusProblem, ring_count, ring_numbers
 from doedesign.spec import Spec
@@ -159,7 +159,11 @@ class FocusTask:
         return f"bending light to {len(self.problem.weight)} foci as rays would"
 
     def steps(self, state: FocusState) -> Iterator[tuple[FocusState, dict[str, Any]]]:
-        """Do the remaining steps one by one; yields the state, and the line of the history."""
+        """Do the remaining steps one by one; yields the state, and the line of the history.
+
+        Raises:
+            InputError: the loss is no longer finite.
+        """
         count, names = self.spec.optimize.steps, list(FocusLight._fields)
         free, heights = round(_FREE * count), jnp.asarray(self.levels.heights_m(), jnp.float32)
         while state.step < count:
@@ -175,7 +179,8 @@ class FocusTask:
                 field = self.problem.field(heights[level])
                 loss, light = self.problem.loss(field), self.problem.judge(field)
             state = FocusState(radians, level, settled, memory, step + 1)
-            yield state, {"step": step, "loss": float(loss), "terms": [float(part) for part in light], "names": names}
+            value = finite_loss(loss, step, "Choose other focus.distances or focus.widths.")
+            yield state, {"step": step, "loss": value, "terms": [float(part) for part in light], "names": names}
 
     def nearest_level(self, radians: Float[Array, " ring"]) -> Int[np.ndarray, " ring"]:
         """Level nearest to every free height; of a single wavelength, as light sees it."""

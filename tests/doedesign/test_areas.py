@@ -15,7 +15,7 @@ from doedesign.areas.design import AreaTask
 from doedesign.areas.problem import mode_fields
 from doedesign.areas.shape import AreaTable, Profile, area_table, areas_of_design, light_on
 from doedesign.areas.target import AreaTarget
-from doedesign.areas.transport import transport_phase
+from doedesign.areas.transport import _coarse, transport_phase
 from doedesign.build import camera_from_spec
 from doedesign.design.design import Design
 from doedesign.lab.order import write_masks
@@ -106,6 +106,44 @@ def test_transport_is_a_lens_where_both_pictures_are_alike():
     inside = np.hypot(at[:, None], at) < 1.5
     np.testing.assert_allclose(x[inside] / (2 * np.pi), (at / 4 + 0.3 + 0 * at[:, None])[inside], atol=0.01)
     np.testing.assert_allclose(y[inside] / (2 * np.pi), (at[:, None] / 4 + 0.3 + 0 * at)[inside], atol=0.01)
+
+
+def test_a_coarse_picture_keeps_all_light_in_its_place():
+    """Lines and dots between coarse cells count as their share; even pictures stay even, small ones as they are."""
+    rows, columns = np.linspace(-3.0, 3.0, 313), np.linspace(-2.0, 2.0, 200)
+    picture = np.zeros((313, 200))
+    picture[40:42], picture[200, 111] = 1.0, 1200.0  # 400 of 1600
+    coarse, (y, x) = _coarse(picture, (rows, columns))
+    assert coarse.shape == (96, 96)
+    assert coarse.sum() == pytest.approx(1)
+    assert coarse[y < 0].sum() == pytest.approx(0.25)
+    for axis, light, middle in (
+        (y, coarse.sum(1), rows @ picture.sum(1)),
+        (x, coarse.sum(0), columns @ picture.sum(0)),
+    ):
+        assert axis @ light == pytest.approx(middle / 1600, abs=0.5 * (axis[1] - axis[0]))
+    even = _coarse(np.ones((313, 200)), (rows, columns))[0]
+    np.testing.assert_allclose(even[1:-1, 1:-1], even[1, 1])
+    small = picture[:90, :96]
+    np.testing.assert_allclose(_coarse(small, (rows[:90], columns[:96]))[0], small / small.sum())
+
+
+def test_a_dot_between_coarse_cells_is_a_place_that_light_is_carried_to():
+    """A single dot of two cells of 500: all light goes there."""
+    at, directions = np.linspace(-1, 1, 60), np.linspace(-1, 1, 500)
+    wanted = np.zeros((500, 500))
+    wanted[123:125, 301] = 1
+    phase = transport_phase(np.ones((60, 60)), (at, at), wanted, (directions, directions))
+    y, x = np.gradient(phase / (2 * np.pi), at, at)
+    np.testing.assert_allclose(x, directions[301], atol=0.03)
+    np.testing.assert_allclose(y, directions[123:125].mean(), atol=0.03)
+
+
+def test_a_loss_that_is_not_finite_is_refused(tmp_path: Path):
+    task = AreaTask.from_spec(spec_of(tmp_path))
+    state = task.initial_state()
+    with pytest.raises(InputError, match="optimize, step 0: the loss must stay finite"):
+        next(task.steps(state._replace(phase=jnp.full_like(state.phase, jnp.nan))))
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import doedesign
 import doedesign.optimization as optimization
 from doedesign.build import camera_from_spec
 from doedesign.focus.depth import focus_of_design, focus_table
+from doedesign.focus.design import FocusTask
 from doedesign.focus.foci import Foci
 from doedesign.prediction import on_target
 from doedesign.runs.level_maps import open_design
@@ -285,6 +286,13 @@ def test_what_cannot_be_is_refused(spec_file: Path, overrides: list[str], key: s
         doedesign.load_spec(spec_file, overrides)
     assert key in str(error.value)
     assert rule in str(error.value)
+
+
+def test_a_loss_that_is_not_finite_is_refused(spec_file: Path):
+    task = FocusTask.from_spec(doedesign.load_spec(spec_file))
+    state = task.initial_state()
+    with pytest.raises(InputError, match="optimize, step 0: the loss must stay finite"):
+        next(task.steps(state._replace(radians=state.radians * np.nan)))
 
 
 def test_foci_need_no_lens(spec_file: Path):
