@@ -44,6 +44,7 @@ from doedesign.runs.folder import (
 from doedesign.runs.level_maps import open_design, read_any_height, write_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, input_files, load_spec, spec_warnings
+from doedesign.spec.values import MOST_STEPS
 from fab.errors import InputError
 from fab.figure import drawn_beside
 from fab.files import canonical_json, write_atomic
@@ -72,6 +73,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("doedesign")
 
 _TRIED, _MANY = 4, 1000  # steps that are timed for a budget, of a run of so many
+_SHORTEST_S = 1e-9  # time of a step, below what clocks tell
 
 
 def optimize(
@@ -136,7 +138,7 @@ def steps_within(
         objectives: as in `optimize`.
 
     Returns:
-        at least 1, however short the time.
+        at least 1, however short the time, and at most the 10 million that a spec allows.
 
     Raises:
         InputError: a time that is not positive, nothing to improve, or as `optimize`.
@@ -154,8 +156,8 @@ def steps_within(
         tried = len(ends) - compiled
         if tried >= _TRIED or (tried > 0 and ends[-1] - start > budget_s / 4):
             break
-    first, each = ends[compiled - 1] - start, (ends[-1] - ends[compiled - 1]) / (len(ends) - compiled)
-    steps = max(1, int((budget_s - first) / each))
+    first, each = ends[compiled - 1] - start, float(np.median(np.diff(ends[compiled - 1 :])))
+    steps = max(1, int(min((budget_s - first) / max(each, _SHORTEST_S), MOST_STEPS)))
     log.info(f"a step takes {each:.2g} s after {first:.2g} s to begin with: {steps} steps in {budget_s:g} s")
     return steps
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from math import isfinite
 from typing import Any
 
+import jax
 import optax
 from jaxtyping import Array
 
@@ -13,8 +14,12 @@ _MOST_TRIES = 12  # of a line search
 
 
 def lbfgs_memory(parameters: Array, steps: int) -> Any:
-    """Memory of L-BFGS before its first step, with room for so many of them."""
-    return _optimiser(steps).init(parameters)
+    """Memory of L-BFGS before its first step, with room for so many of them.
+
+    Its types are those of the memory after a step, so that the second step needs no compilation of its own.
+    """
+    memory = _optimiser(steps).init(parameters)
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), memory)  # none of them weak
 
 
 def lbfgs_step(loss: Callable[[Array], Array], parameters: Array, memory: Any, steps: int) -> tuple[Array, Any, Array]:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from doedesign.areas.target import AreaTarget
 from doedesign.areas.transport import _coarse, transport_phase
 from doedesign.build import camera_from_spec
 from doedesign.design.design import Design
+from doedesign.design.lbfgs import lbfgs_memory, lbfgs_step
 from doedesign.lab.order import write_masks
 from doedesign.optimization import optimize
 from doedesign.prediction import predict
@@ -137,6 +139,19 @@ def test_a_dot_between_coarse_cells_is_a_place_that_light_is_carried_to():
     y, x = np.gradient(phase / (2 * np.pi), at, at)
     np.testing.assert_allclose(x, directions[301], atol=0.03)
     np.testing.assert_allclose(y, directions[123:125].mean(), atol=0.03)
+
+
+def test_a_step_of_lbfgs_keeps_all_types_so_that_it_is_compiled_once():
+    """Weak types would count, too."""
+
+    def step(parameters: jax.Array, memory: Any) -> Any:
+        return lbfgs_step(lambda given: jnp.sum(given**2), parameters, memory, 3)[:2]
+
+    parameters = jnp.zeros(5, jnp.float32)
+    before = parameters, lbfgs_memory(parameters, 3)
+    after = jax.eval_shape(step, *before)
+    kinds = [[(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(each)] for each in (before, after)]
+    assert kinds[0] == kinds[1]
 
 
 def test_a_loss_that_is_not_finite_is_refused(tmp_path: Path):

@@ -208,11 +208,17 @@ def test_a_budget_becomes_a_number_of_steps(tmp_path: Path, monkeypatch: pytest.
     times = iter([0.0, 2.0, 2.1, 2.2, 2.3, 2.4, 2.5])
     monkeypatch.setattr(optimization, "_trial", lambda spec, objectives: iter(range(spec.optimize.steps)))
     monkeypatch.setattr(optimization.time, "perf_counter", lambda: next(times))
-    assert optimization.steps_within(spec, 10.0) == 80  # (10 - 2) / 0.1
+    assert optimization.steps_within(spec, 10.05) == 80  # (10.05 - 2) / 0.1
     times = iter([0.0, 2.0, 2.1, 2.2])
     assert optimization.steps_within(spec, 1.0) == 1  # too short a time for more
     times = iter([0.0, 2.0, 4.0, 6.0, 6.1, 6.2, 6.3, 6.4])
-    assert optimization.steps_within(load_spec(EXAMPLES / "quick.toml", SMALL), 10.0) == 40  # (10 - 6) / 0.1
+    assert optimization.steps_within(load_spec(EXAMPLES / "quick.toml", SMALL), 10.05) == 40  # (10.05 - 6) / 0.1
+    times = iter([0.0, 1.0, 2.0, 2.1, 2.2, 2.3])
+    assert optimization.steps_within(spec, 10.05) == 90  # one slow step of four is not what a step takes
+    for instants in ([0.0, 1e-7, 2e-7, 3e-7, 4e-7, 5e-7], [0.0] * 6):
+        times = iter(instants)
+        steps = optimization.steps_within(spec, 1e6)  # as many as a spec allows
+        assert load_spec(EXAMPLES / "quick.toml", [f"optimize.steps={steps}"]).optimize.steps == steps == 10_000_000
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="budget: must be positive seconds"):
             optimization.steps_within(spec, wrong)
@@ -222,7 +228,7 @@ def test_a_budget_becomes_a_number_of_steps(tmp_path: Path, monkeypatch: pytest.
     assert optimization.steps_within(spec, 10.0, tmp_path / "run") == 7
     other = load_spec(EXAMPLES / "quick.toml", [*together, "optimize.seed=3"])
     times = iter([0.0, 2.0, 2.1, 2.2, 2.3, 2.4, 2.5])
-    assert optimization.steps_within(other, 10.0, tmp_path / "run") == 80
+    assert optimization.steps_within(other, 10.05, tmp_path / "run") == 80
     with pytest.raises(InputError, match="something to improve"):
         optimization.steps_within(load_spec(EXAMPLES / "quick.toml", ["objective=[]", "optimize.steps=0"]), 10.0)
 

@@ -299,7 +299,9 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 NotNegative = Annotated[float, Field(strict=True, ge=0)]
 Seed = Annotated[int, Field(strict=True, ge=0, lt=2**32)]
-Steps = Annotated[int, Field(strict=True, ge=0, le=10_000_000)]
+MOST_STEPS = 10_000_000
+"""Steps of an optimisation or a training, at most."""
+Steps = Annotated[int, Field(strict=True, ge=0, le=MOST_STEPS)]
 
 _COLOUR_NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 _COLOUR_RULE = "must be a name of at most 32 letters, digits, dashes, underscores"
