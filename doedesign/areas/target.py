@@ -161,16 +161,22 @@ def _size_text(camera: Camera, size_m: float) -> str:
 
 
 def finest_detail_m(camera: Camera) -> float:
-    """Size of detail that light can draw: the radius of a Gaussian beam's focus, 2 lambda d / D of plane light.
+    """Size of detail that light can draw, metres: the radius of a Gaussian beam's focus, 2 lambda d / D of plane light.
 
-    D is the shorter side of an aperture that is not round.
+    The focus is that of the beam as wide as it is on the DOE, wherever its waist lies. D is the shorter side of an
+    aperture that is not round.
+
+    Args:
+        camera: beam, aperture, sensor, and the first wavelength.
     """
-    scale = camera.lines[0].wavelength_m * camera.sensor_distance_m
+    wavelength = camera.lines[0].wavelength_m
+    scale = wavelength * camera.sensor_distance_m
     finest = scale / min(camera.opening.sizes_m)
     if not isinstance(camera.beam, GaussianBeam):
         return 2 * finest
     quality = np.sqrt(np.prod(camera.beam.m_squared))
-    return float(max(quality * scale / np.pi / np.sqrt(np.prod(camera.beam.radius_m)), finest))
+    radius = np.sqrt(np.prod(camera.beam.diameters_m(wavelength))) / 2
+    return float(max(quality * scale / np.pi / radius, finest))
 
 
 def _require_reach(camera: Camera, farthest: float) -> None:

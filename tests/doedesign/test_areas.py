@@ -15,7 +15,7 @@ import doedesign.optimization as optimization
 from doedesign.areas.design import AreaTask
 from doedesign.areas.problem import mode_fields
 from doedesign.areas.shape import AreaTable, Profile, area_table, areas_of_design, light_on
-from doedesign.areas.target import AreaTarget
+from doedesign.areas.target import AreaTarget, finest_detail_m
 from doedesign.areas.transport import _coarse, transport_phase
 from doedesign.build import camera_from_spec
 from doedesign.design.design import Design
@@ -152,6 +152,17 @@ def test_a_step_of_lbfgs_keeps_all_types_so_that_it_is_compiled_once():
     after = jax.eval_shape(step, *before)
     kinds = [[(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(each)] for each in (before, after)]
     assert kinds[0] == kinds[1]
+
+
+def test_detail_is_as_fine_as_the_beam_on_the_plate_is_wide(tmp_path: Path):
+    """The radius of a focus is wavelength x f / (pi w), with w = w0 sqrt(1 + (z / z_R)²) on the plate."""
+    beam = ["illumination.kind=gaussian", 'illumination.diameter="150 um"', 'illumination.waist_distance="50 mm"']
+    rayleigh = np.pi * 75e-6**2 / 532e-9
+    radius = 75e-6 * np.sqrt(1 + (50e-3 / rayleigh) ** 2)
+    spread = camera_from_spec(spec_of(tmp_path, *beam))
+    assert finest_detail_m(spread) == pytest.approx(532e-9 * 20e-3 / np.pi / radius)
+    waist = camera_from_spec(spec_of(tmp_path, *beam[:2]))
+    assert finest_detail_m(waist) == pytest.approx(532e-9 * 20e-3 / np.pi / 75e-6)
 
 
 def test_a_loss_that_is_not_finite_is_refused(tmp_path: Path):

@@ -34,7 +34,8 @@ class AreaSpec(SpecTable, frozen=True):
         height_m: size along y; of rectangles and ellipses the width if left out.
         inner_m: inner diameter of a ring.
         edge_m: distance over which light should fall from 90 to 13.5 % of its value inside; by default the radius of
-            the focus of a Gaussian beam, 2 wavelength x focal length / aperture for other light.
+            the focus of a Gaussian beam, as wide as it is on the DOE, 2 wavelength x focal length / aperture for other
+            light.
         picture: a file with the light to be drawn, relative to the spec file: PNG, TIFF or JPEG, in the usual sRGB.
         phase: of the light of the area, free if left out: "flat", or a file with a grey picture of it over the area,
             black for 0 and white for one turn less a step of its greys, relative to the spec file: PNG or TIFF. It is
