@@ -14,7 +14,7 @@ from doedesign.spec.targets.areas import area_problems
 from doedesign.spec.targets.focus import focus_problems
 from doedesign.spec.targets.spots import spot_problems
 from doedesign.spec.training import training_problems
-from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, RANDOM_QUANTISATIONS, nearest
+from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, RANDOM_QUANTISATIONS, STARTS, nearest
 from doedesign.spec.values.table import toml_key
 from fab.aperture import MaskAperture
 from fab.errors import InputError
@@ -34,7 +34,7 @@ _BEAM_KEYS = {
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_distance, _light, _doe, _sensor, _lens, _illumination, _scene, _fresnel_sampling, _objectives, _process)
-    rules = (*rules, _quantisation, _printing, robust_problems, _limits, _training)
+    rules = (*rules, _start, _quantisation, _printing, robust_problems, _limits, _training)
     rules = (*rules, spot_problems, area_problems, focus_problems)
     return [problem for rule in rules for problem in rule(spec)]
 
@@ -267,6 +267,13 @@ def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
         f"For this aperture the pitch may be at most {rounded(wavelength_m * focal_m / span_m)} "
         f'(samples = {samples}, pitch = "{rounded(span_m / samples)}"); or set propagation = "far_field".',
     )
+
+
+def _start(spec: Spec) -> Iterator[InputError]:
+    optimize = spec.optimize
+    if optimize.start not in STARTS and optimize.start_options:
+        rule, cure = "a start that is a file takes none", "Leave them out, or start_options = {}."
+        yield InputError("optimize.start_options", rule, ", ".join(optimize.start_options), cure)
 
 
 def _quantisation(spec: Spec) -> Iterator[InputError]:

@@ -216,7 +216,7 @@ class OptimizeSpec(SpecTable, frozen=True):
         start: a built-in one, which with `steps = 0` is a design of its own: "flat", "random", "fresnel", "ring",
             "nlopt", "axicon", "vortex", "blazed", "lens_array", "cubic", "quartic", "axilens",
             "logarithmic_asphere" (`doedesign.design.starts`); or the path of a height map relative to the spec file.
-        start_options: keyword arguments of the start.
+        start_options: keyword arguments of the start; a file takes none.
         steps: optimisation steps; 0 evaluates the start.
         learning_rate: step size of Adam, in radians of phase at the design wavelength.
         seed: seed of everything random.

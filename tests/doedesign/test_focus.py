@@ -279,6 +279,7 @@ def test_one_distance_for_several_colours_is_no_focus_twice(spec_file: Path):
         ([*BEAM, 'illumination.angle=["1 deg", "0 deg"]'], "illumination.angle", "on the axis of the beam"),
         ([*BEAM, 'illumination.centre=["5 um", "0 um"]'], "illumination.centre", "on the axis of the beam"),
         (["optimize.start=random"], "optimize.start", "starts, steps and levels of their own"),
+        (["optimize.start_options.charge=2"], "optimize.start_options", "levels of their own, but got charge"),
     ],
 )
 def test_what_cannot_be_is_refused(spec_file: Path, overrides: list[str], key: str, rule: str):

@@ -291,6 +291,13 @@ def test_a_mistake_in_the_file_names_the_file(edited: Callable[..., Path]):
     assert len(message.splitlines()) == 1  # and not that `levels` must be given
 
 
+def test_options_of_a_start_that_is_a_file_are_refused():
+    """They did nothing; an empty table is none."""
+    given = [AUTOMOTIVE, "optimize.start=start.exr", "optimize.start_options.duty=0.3"]
+    assert "optimize.start_options: a start that is a file takes none, but got duty. Leave" in refusal(*given)
+    load_spec(AUTOMOTIVE, ["optimize.start=start.exr", "optimize.start_options={}"])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

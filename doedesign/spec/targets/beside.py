@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _OWN = (
     "parametrization",
     "start",
+    "start_options",
     "learning_rate",
     "quantisation",
     "sampling",
@@ -45,6 +46,8 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
         if got != type(spec.optimize).model_fields[name].default:
             rule = "spots, areas and foci have starts, steps and levels of their own"
             shown = f'"{got}"' if isinstance(got, str) else format_length(got) if name.endswith("_m") else got
+            if name == "start_options":
+                shown = ", ".join(got)
             yield InputError(f"optimize.{toml_key(name)}", rule, shown, "Leave it out.")
 
 
