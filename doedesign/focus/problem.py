@@ -60,8 +60,9 @@ class FocusProblem(eqx.Module):
     """A DOE of rings to be designed for foci. A focus has a part for every line of its colour.
 
     Attributes:
-        kernel: `[part, place, ring]` amplitude of every ring over that of an ideal lens on the axis, times the root of
-            the line's share of the colour.
+        kernel: `[part, place, ring]` amplitude of every ring over that of an ideal lens on the axis, as reports have it
+            (`sim.propagation.near_axis.profiles`), times the root of the line's share of the colour. Lines of a colour
+            count by what rings in step would make of each.
         rate: `[part]` waves per metre of height.
         focus: `[part]` focus that it belongs to, increasing.
         weight: `[focus]` share of the merit.
@@ -81,12 +82,14 @@ class FocusProblem(eqx.Module):
         for number in range(len(foci.distance_m)):
             places, distance = np.array((0.0, *BESIDE)) * foci.width_m[number], float(foci.distance_m[number])
             own = [k for k, line in enumerate(camera.lines) if line.colour == foci.colour[number]]
-            whole = sum(camera.lines[k].factor for k in own)
-            for k in own:
-                line = camera.lines[k]
-                kernel = cells[k].kernel(places, distance, line, pitch, count)
-                share = np.sqrt(line.factor / whole) / np.abs(kernel[0]).sum()
-                kernels.append((kernel * share).astype(np.complex64))
+            lines = [camera.lines[k] for k in own]
+            shares = np.array([line.factor for line in lines]) / sum(line.factor for line in lines)
+            found = [cells[k].kernel(places, distance, camera.lines[k], pitch, count) for k in own]
+            ideal = np.array([cells[k].ideal(distance, camera.lines[k], pitch) for k in own])
+            most = np.array([np.abs(kernel[0]).sum() for kernel in found])  # of rings in step
+            kept = np.sqrt(shares @ most**2 / (shares @ ideal**2))
+            for line, kernel, scale in zip(lines, found, kept * np.sqrt(shares) / most, strict=True):
+                kernels.append((kernel * scale).astype(np.complex64))
                 rates.append(camera.waves_per_metre(line.wavelength_m))
                 owners.append(number)
         return cls(

@@ -68,6 +68,22 @@ class Octant(NamedTuple):
             found.append(next(parts) + 1j * next(parts))
         return np.stack(found)
 
+    def ideal(self, distance_m: float, line: SpectralLine, pitch_m: float) -> float:
+        """Amplitude on the axis that an ideal lens would make of this light, in the unit of `kernel`; see `profiles`.
+
+        Args:
+            distance_m: of the place behind the DOE.
+            line: wavelength.
+            pitch_m: of the cells.
+        """
+        path = np.sqrt(self.y_m**2 + self.x_m**2 + distance_m**2)
+        return _ideal(self.light, path, distance_m, line.wavelength_m, pitch_m)
+
+
+def _ideal(light: Any, path_m: Any, distance_m: float, wavelength_m: float, pitch_m: float) -> float:
+    """Amplitude on the axis of light in step there, from points instead of cells."""
+    return float(np.sum(np.abs(light) / path_m**2)) * pitch_m**2 * distance_m / wavelength_m
+
 
 def _flat(camera: Camera, field: Complex[np.ndarray, "y x"], line: SpectralLine) -> Complex[np.ndarray, "y x"]:
     """The field without the curvature of a wave to the camera's own sensor."""
@@ -115,7 +131,7 @@ def profiles(
     light, path = _towards_axis(field, y, x, distance_m, wavelength, pitch)
     sines = y / path / wavelength, x / path / wavelength
     scale = 1 / np.sqrt(camera.opening.area_m2)
-    ideal = float(np.sum(np.abs(field) / path**2)) * pitch**2 * distance_m / wavelength
+    ideal = _ideal(field, path, distance_m, wavelength, pitch)
     return scale * np.stack([_transform(light, sine, places_m) for sine in sines]), scale * ideal
 
 

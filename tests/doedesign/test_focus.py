@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import j0
@@ -287,6 +288,18 @@ def test_what_cannot_be_is_refused(spec_file: Path, overrides: list[str], key: s
         doedesign.load_spec(spec_file, overrides)
     assert key in str(error.value)
     assert rule in str(error.value)
+
+
+@pytest.mark.parametrize("colours", [[], ['optics.wavelengths=["640 nm","532 nm"]']])
+def test_the_strength_of_a_search_is_that_of_the_report(spec_file: Path, colours: list[str]):
+    """Both are over the light of an ideal lens, which loses none to the width of cells."""
+    task = FocusTask.from_spec(doedesign.load_spec(spec_file, [*BIFOCAL, *colours, "optimize.steps=10"]))
+    *_, (state, _) = task.steps(task.initial_state())
+    design = task.finished(state, [])
+    light = task.problem.judge(task.problem.field(jnp.asarray(task.levels.heights_m(), jnp.float32)[state.level]))
+    table = focus_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
+    mean = np.exp(table.foci.weight @ np.log(table.strength))
+    assert float(light.strength) == pytest.approx(mean, rel=1e-3)
 
 
 def test_a_loss_that_is_not_finite_is_refused(spec_file: Path):
