@@ -206,8 +206,15 @@ def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
 
     Squared distances, each relative to its target's: |p_far - delta|² / |delta|² where delta is all light in the far
     spot, and log(1 + |p_near - u|² / |u|²) where u spreads all light evenly over the window.
+
+    Args:
+        psfs: PSFs of a step.
+        near_weight: weight of the near PSF.
+
+    Raises:
+        InputError: a weight that is no number.
     """
-    if not isinstance(near_weight, int | float):
+    if not isinstance(near_weight, int | float) or isinstance(near_weight, bool):
         raise InputError("handcrafted: near_weight", "must be a number", repr(near_weight), "For example 1.0.")
     spots = spot_weights(psfs.camera)
     even = 1.0 / psfs.camera.window**2
@@ -235,14 +242,16 @@ def filtered_error(psfs: PsfSet, *, noise: float = 0.01, contrast: float = 0.25,
         known: whether every depth has a filter of its own.
 
     Raises:
-        InputError: a number that is not positive.
+        InputError: a number that is not positive, or a `known` that is neither true nor false.
     """
+    if not isinstance(known, bool):
+        raise InputError("filtered_error: known", "must be true or false", repr(known), "For example known = true.")
     for name, value in (("noise", noise), ("contrast", contrast)):
         if not isinstance(value, int | float) or isinstance(value, bool) or not value > 0:
             raise InputError(f"filtered_error: {name}", "must be above 0, white being 1", repr(value), "Try 0.01.")
     side = psfs.far.shape[-1]
     signal = photograph_spectrum(side, float(contrast) ** 2)
-    return psfs.highest(filter_errors(transfers(psfs.far), signal, float(noise) ** 2 / side**2, bool(known)))
+    return psfs.highest(filter_errors(transfers(psfs.far), signal, float(noise) ** 2 / side**2, known))
 
 
 def _spots(psfs: PsfSet) -> Float[Array, "w f"]:

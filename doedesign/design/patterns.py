@@ -79,7 +79,8 @@ def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
     from scipy.special import j1
 
     count = options.get("count")
-    if not (isinstance(count, tuple) and len(count) == 2 and all(isinstance(n, int) and n > 0 for n in count)):
+    # True would count as 1.
+    if not (isinstance(count, tuple) and len(count) == 2 and all(type(n) is int and n > 0 for n in count)):
         rule = "must be two positive whole numbers"
         raise InputError(f"{where}: count", rule, repr(count), "For example count = [5, 5].")
     centres = spot_centres_m(count, positive_place(options.get("spacing"), camera, f"{where}: spacing"))

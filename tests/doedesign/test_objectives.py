@@ -1,5 +1,6 @@
 """Objectives against PSFs whose value is known."""
 
+import inspect
 import json
 import sys
 from dataclasses import replace
@@ -212,7 +213,7 @@ def test_spots_are_airy_patterns_at_the_points_of_a_grid() -> None:
     assert target_image(CAMERA, options | {"count": (2, 1), "spacing": "252 um"}, None, "objective").sum() > 0
 
 
-@pytest.mark.parametrize("count", [None, [3, 3], (3,), (3, 3, 3), (0, 3), (3, -1), (3, 2.0)])
+@pytest.mark.parametrize("count", [None, [3, 3], (3,), (3, 3, 3), (0, 3), (3, -1), (3, 2.0), (True, 3)])
 def test_a_grid_of_spots_needs_two_numbers(count: Any) -> None:
     options = {"pattern": "spots", "count": count, "spacing": "60 um"}
     with pytest.raises(InputError, match="count: must be two positive whole numbers"):
@@ -490,6 +491,16 @@ def test_wrong_objectives_are_named(overrides: list[str], words: str) -> None:
     spec = load_spec(EXAMPLES / "quick.toml", overrides)
     with pytest.raises(InputError, match=words):
         terms_from_spec(spec, CAMERA, {}, import_objectives(spec))
+
+
+def test_a_flag_is_no_number_and_no_word() -> None:
+    """They are refused: "false" would be true, and true would be 1."""
+    psfs = view(even(), point())
+    for known in ("false", 1, None):
+        with pytest.raises(InputError, match="filtered_error: known: must be true or false"):
+            inspect.unwrap(filtered_error)(psfs, known=cast("Any", known))  # past the checks of types that tests have
+    with pytest.raises(InputError, match="handcrafted: near_weight: must be a number, but got True"):
+        handcrafted(psfs, near_weight=True)
 
 
 def test_a_spec_alone_runs_no_code() -> None:
