@@ -112,8 +112,21 @@ class Term(NamedTuple):
     cases: Cases = Cases()
 
     def value(self, psfs: PsfSet) -> Array:
-        """Value for the PSFs of all colours and depths of a step."""
-        return self.function(self.cases.among(psfs))
+        """Value for the PSFs of all colours and depths of a step.
+
+        Args:
+            psfs: the PSFs.
+
+        Raises:
+            InputError: an objective of the user's own that returns something else than one real number.
+        """
+        value = self.function(self.cases.among(psfs))
+        number = isinstance(value, jax.Array | np.ndarray | np.generic | int | float)
+        if not number or jnp.shape(value) or not jnp.isrealobj(value):
+            got = f"{jnp.result_type(value)} of shape {jnp.shape(value)}" if number else type(value).__name__
+            cure = "Return a scalar, such as jnp.mean(...) of what it is now."
+            raise InputError(f"objective {self.name}", "must return one real number", got, cure)
+        return value
 
     @property
     def target(self) -> Float[np.ndarray, "y x"] | None:
@@ -309,7 +322,7 @@ def import_objectives(spec: Spec) -> dict[str, Objective]:
     """Import the objectives of the user's own that a spec names `module:function`: this runs code that it names.
 
     Raises:
-        InputError: no such module or function.
+        InputError: no such module or function, or a module that fails when it is imported.
     """
     named = {f"objective[{i}]": one.name for i, one in enumerate(spec.objectives) if one.name not in BUILT_IN}
     return {name: _imported(name, where) for where, name in named.items()}
@@ -343,6 +356,9 @@ def _imported(name: str, where: str) -> Objective:
         rule = "a user's objective must be an importable module:function"
         cure = "Put the module on PYTHONPATH and check both names."
         raise InputError(where, rule, f'"{name}" ({error})', cure) from error
+    except Exception as error:  # whatever the user's code raises
+        rule, got = "the module of a user's objective must run", f'"{name}" ({type(error).__name__}: {error})'
+        raise InputError(where, rule, got, f"Correct {module_name}.") from error
     if not callable(function):
         raise InputError(where, "a user's objective must be a function", f'"{name}"', "Name a function.")
     return cast("Objective", function)
@@ -350,7 +366,11 @@ def _imported(name: str, where: str) -> Objective:
 
 def _require_options(function: Objective, options: Mapping[str, Any], where: str) -> None:
     """Check before a long run that the function takes one `PsfSet` and the given options."""
-    signature = inspect.signature(function)
+    try:
+        signature = inspect.signature(function)
+    except ValueError as error:  # some that are not written in Python
+        rule, cure = "must be a function that tells its arguments", "Call it in a function of your own."
+        raise InputError(where, rule, str(error), cure) from error
     try:
         signature.bind(None, **options)
     except TypeError as error:

@@ -481,6 +481,10 @@ def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
         (["objective.0.name=no_such_module:f"], "importable module:function"),
         (["objective.0.name=math:no_such_function"], "importable module:function"),
         (["objective.0.name=math:pi"], "must be a function"),
+        (
+            ["objective.0.name=builtins:max"],
+            "builtins:max: must be a function that tells its arguments",
+        ),
         (["objective.0.options.radius=3"], "must be options of far_spot"),
         (["objective.0.name=target_pattern", "objective.0.options.pattern=hexagon"], "must be one of spots"),
         (["objective.0.name=target_pattern", "objective.0.options.pattern=square"], "must be a length"),
@@ -491,6 +495,27 @@ def test_wrong_objectives_are_named(overrides: list[str], words: str) -> None:
     spec = load_spec(EXAMPLES / "quick.toml", overrides)
     with pytest.raises(InputError, match=words):
         terms_from_spec(spec, CAMERA, {}, import_objectives(spec))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("def dark(psfs:", r"module of a user's objective must run, but got \"broken_own:dark\" \(SyntaxError"),
+        ("dark = bright", r"\(NameError: name 'bright' is not defined\). Correct broken_own."),
+        ("def dark(psfs):\n    return psfs.far", r"broken_own:dark: must return one real number, .* \(1, 1, 64, 64\)"),
+        ("def dark(psfs):\n    return None", "broken_own:dark: must return one real number, but got NoneType"),
+        ("def dark(psfs):\n    return 1j * psfs.far.max()", "one real number, but got complex64"),
+    ],
+)
+def test_an_objective_with_a_fault_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, words: str
+) -> None:
+    (tmp_path / "broken_own.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "broken_own", raising=False)
+    spec = load_spec(EXAMPLES / "quick.toml", ["objective.0.name=broken_own:dark"])
+    with pytest.raises(InputError, match=words):
+        terms_from_spec(spec, CAMERA, {}, import_objectives(spec))[0].value(view(even(), point()))
 
 
 def test_a_flag_is_no_number_and_no_word() -> None:
