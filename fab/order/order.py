@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fab.errors import InputError
 from fab.files import IF_ANY, canonical_json, sha256_bytes
@@ -244,9 +244,12 @@ def plan_order(
     """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`.
 
     Raises:
-        InputError: what `Order` refuses, a process of another staircase, one that takes no plates at 1:1 unless those
-            are asked for, or masks that it cannot print where that is to fail.
+        InputError: what `Order` refuses, an unknown `on_violation`, a process of another staircase, one that takes no
+            plates at 1:1 unless those are asked for, or masks that it cannot print where that is to fail.
     """
+    if on_violation not in get_args(OnViolation):
+        rule = f"must be one of {', '.join(get_args(OnViolation))}"
+        raise InputError("on_violation", rule, repr(on_violation), "Choose one of these.")
     made_by = process_from(process, level_map.levels)
     if made_by.reduction > 1 and not one_to_one:
         rule = "must print plates at 1:1 by contact, a whole wafer at a time, which is what is drawn"

@@ -245,6 +245,13 @@ def test_lengths_that_no_drawing_has_are_refused(length_m):
             Grid((4, 4), pitch_m)
 
 
+@pytest.mark.parametrize("word", ["error", "Fail", "fial", None])
+def test_what_to_do_about_broken_rules_is_one_of_three_words(level_map, word):
+    """A misspelt word would be a warning, and an order that the process cannot print."""
+    with pytest.raises(InputError, match=r"on_violation: must be one of warn, fail, fix, but got .*Choose"):
+        plan_order(level_map, process="contact_aligner", on_violation=word)
+
+
 def test_a_name_of_which_nothing_is_left_is_refused():
     with pytest.raises(InputError, match="mask order name"):
         plain_name("***")
