@@ -48,7 +48,11 @@ def layer_properties(order: Order, layers: Iterable[Layer]) -> bytes:
 
 
 def drc_deck(order: Order, review: str) -> bytes:
-    """Return the deck of checks (Ruby) for KLayout, which reads the review file of that name beside it."""
+    """Return the deck of checks (Ruby) for KLayout, which reads the review file of that name beside it.
+
+    The process prints the planes as designed from edges that were moved against its bias; so the deck moves them back
+    before it measures lines and spaces, as the rules do (`fab.rules.check`).
+    """
     process, grid_m = order.process, order.terms.address_grid_m or order.dbu_m
     masks = [
         [photomask.name, order.plate_file(order.photomask_stem(photomask)), photomask.layer, photomask.bit is not None]
@@ -61,7 +65,11 @@ def drc_deck(order: Order, review: str) -> bytes:
         "LINE_UM": round(process.minimum_line_m / UM, 9),
         "SPACE_UM": round(process.minimum_space_m / UM, 9),
         "MASKS": masks,
-        "DOES": [f"{order.stem}_{split.code}" for split in order.splits],
+        # How far the edges of every mask are moved outward, mask 1 first.
+        "DOES": [
+            [f"{order.stem}_{split.code}", [round(move * order.dbu_m / UM, 9) for move in split.moves]]
+            for split in order.splits
+        ],
     }
     # JSON of text, numbers, lists and booleans is Ruby.
     head = "".join(f"{name} = {json.dumps(value)}\n" for name, value in constants.items())

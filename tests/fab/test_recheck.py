@@ -1,17 +1,26 @@
 """What a lab checks again with KLayout alone: layer colours that KLayout reads, and a deck that finds what is wrong."""
 
+import json
 import shutil
 import subprocess
 
 import klayout.db as kdb
 import klayout.lay as lay
+import numpy as np
 import pytest
 
+from fab.aperture import RectangularAperture
 from fab.gds.reader import read_gds
+from fab.grid import Grid
+from fab.layout.doe import mask_layout
+from fab.layout.geometry import Layer
+from fab.layout.wafer import Wafer
+from fab.level_map import LevelMap
+from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.order import plan_order
 from fab.order.recheck import drc_deck
-from fab.process import Process
+from fab.process import Normal, Process
 from tests.orders import named
 
 
@@ -34,6 +43,49 @@ def test_the_deck_names_every_file_and_the_rules_of_the_process(written_order, l
     process = Process(level_map.levels, minimum_line_m=1.2e-6, minimum_space_m=1.5e-6)
     head = drc_deck(plan_order(level_map, process=process), "x.oas").decode()
     assert "LINE_UM = 1.2\nSPACE_UM = 1.5\n" in head
+
+
+def deck_findings(order):
+    """How many narrow lines, narrow spaces and edges that are not moved the numbers of the deck find in an order."""
+    head = drc_deck(order, "x.oas").decode().split("\n\n")[0]
+    said = {name: json.loads(value) for name, value in (line.split(" = ", 1) for line in head.splitlines())}
+    line, space = (round(said[name] * 1e-6 / order.dbu_m) for name in ("LINE_UM", "SPACE_UM"))
+    found = [0, 0, 0]
+    for (cell, moves), split in zip(said["DOES"], order.splits, strict=True):
+        assert cell == f"{order.stem}_{split.code}"
+        drawn_as = mask_layout(order.level_map, "X", order.chrome, split.moves, split.bits)
+        for number, move_um in enumerate(moves, 1):
+            drawn, move = kdb.Region(), round(move_um * 1e-6 / order.dbu_m)
+            for box in drawn_as.top.shapes[Layer(number)].rectangles.tolist():
+                drawn.insert(kdb.Box(*box))
+            doe = drawn.sized(-move)
+            found[0] += doe.width_check(line, False, kdb.Region.Projection).count()
+            found[1] += doe.space_check(space, False, kdb.Region.Projection).count()
+            found[2] += (drawn ^ doe.sized(move)).count()
+    return found
+
+
+@pytest.mark.parametrize("bias_m", [0.1e-6, -0.1e-6])
+def test_the_deck_measures_moved_masks_as_the_rules_do(bias_m):
+    """Bars of 1 um, the narrowest that prints, and blocks one pixel beside each other's columns, drawn moved."""
+    levels, grid, level = Levels(4, 75e-9), Grid((30, 60), 0.5e-6), np.full((30, 60), 3, np.uint8)
+    level[:, 4::4] = level[:, 5::4] = 0
+    level[:9], level[1:4, 2:6], level[4:7, 7:11], level[1:4, 14:18], level[4:7, 17:21] = 3, 0, 0, 0, 0
+    narrow = {"common_cd_bias_m": Normal(bias_m, 0.0)}
+    process = Process(levels, spreads=narrow, minimum_line_m=1e-6, minimum_space_m=1e-6)
+    wafer = Wafer(compensate=True, line_splits_m=(-0.05e-6, 0.05e-6), order_control=True)
+    plate = LevelMap(level, levels, grid, RectangularAperture(grid.extent_m))
+    order = plan_order(plate, process=process, wafer=wafer)
+    assert order.rules.clean
+    assert order.edge_moves() == (round(-bias_m * 1e9),) * 2
+    assert deck_findings(order) == [0, 0, 0]
+    deck = drc_deck(order, "x.oas").decode()
+    assert "doe = drawn.sized(-move)" in deck
+    assert "told(drawn ^ doe.sized(move)" in deck
+    level[20, 6::4] = 0  # spaces of one pixel
+    coarse = plan_order(plate.with_level(level), process=process, wafer=wafer)
+    assert not coarse.rules.printable
+    assert deck_findings(coarse)[1] > 0
 
 
 def run_deck(folder, tmp_path):
