@@ -40,14 +40,18 @@ def write_models(folder: Path, stem: str, model: DoeModel) -> list[ModelEntry]:
     """Write every kind of file that a DOE has into a folder; return their entries (`model_entries`)."""
     entries = model_entries(folder, stem, model)
     for entry in entries:
-        _kind(entry).write(folder / entry.file, model)
+        if kind := _kind(entry):
+            kind.write(folder / entry.file, model)
     return entries
 
 
 def model_problems(folder: Path, entry: ModelEntry, model: DoeModel) -> list[str]:
     """Read a file back and compare it with what its entry says and with the DOE; one sentence per difference."""
+    kind = _kind(entry)
+    if kind is None:
+        return ["a kind of file that this version does not know: verify the order with the version that wrote it"]
     try:
-        return _kind(entry).problems(folder / entry.file, entry, model)
+        return kind.problems(folder / entry.file, entry, model)
     except (InputError, CheckFailed) as error:
         # A disk too full to draw the file again, elsewhere, says nothing about the file.
         if isinstance(error, InputError) and isinstance(error.__cause__, OSError) and str(folder) not in error.where:
@@ -55,5 +59,6 @@ def model_problems(folder: Path, entry: ModelEntry, model: DoeModel) -> list[str
         return [str(error)]
 
 
-def _kind(entry: ModelEntry) -> ModelKind:
-    return next(kind for kind in KINDS if entry.file.endswith(kind.ending))
+def _kind(entry: ModelEntry) -> ModelKind | None:
+    """Return the kind of a file; None for one of a later version."""
+    return next((kind for kind in KINDS if entry.file.endswith(kind.ending)), None)

@@ -1,5 +1,7 @@
 """A new kind of file in an order is a module of its own and one line in `fab.solids.write.KINDS`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from fab.order.write import write_order
 from fab.solids import write
 from fab.solids.model import ModelKind, model_entry
 from tests.fab.maps import FEW, level_map_from
-from tests.fab.mended import mend, told
+from tests.fab.mended import mend, restate, told
 from tests.orders import named
 
 
@@ -63,3 +65,9 @@ def test_what_is_wrong_in_it_is_told(order):
 def test_a_kind_that_nobody_knows_is_told(order, monkeypatch):
     monkeypatch.setattr(write, "KINDS", write.KINDS[:-2])
     assert f"models: {counts(order)} should not be there" in told(order.folder, "manifest.json")
+
+
+def test_a_kind_of_another_version_is_told(order, monkeypatch):
+    restate(order.folder, lambda manifest: replace(manifest, tools={**manifest.tools, "doedesign": "99.0"}))
+    monkeypatch.setattr(write, "KINDS", write.KINDS[:-2])
+    assert "a kind of file that this version does not know" in told(order.folder, counts(order))
