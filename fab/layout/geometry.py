@@ -73,8 +73,10 @@ class Shapes:
         """Twice the summed area of the shapes in squared database units, exact."""
         total = sum(abs(doubled_area(polygon)) for polygon in self.polygons)
         if len(self.rectangles):
-            x0, y0, x1, y1 = self.rectangles.T
-            total += 2 * int(np.sum((x1 - x0).astype(np.int64) * (y1 - y0)))
+            x0, y0, x1, y1 = self.rectangles.T.astype(np.int64)
+            # Sides of up to 32 bits: an area fills 64, and the sums of the halves of many are exact.
+            areas = (x1 - x0).astype(np.uint64) * (y1 - y0).astype(np.uint64)
+            total += 2 * ((int(np.sum(areas >> 32)) << 32) + int(np.sum(areas & 0xFFFFFFFF)))
         return total
 
     @property

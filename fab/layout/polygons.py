@@ -278,6 +278,8 @@ def frame_around_box(half_x: int, half_y: int, half: int) -> list[NDArray[np.int
 def doubled_area(polygon: NDArray[np.integer]) -> int:
     """Return twice the signed area of a polygon ``(v, 2)`` of integers, exact; counter-clockwise is positive."""
     x, y = polygon.astype(np.int64).T
-    # Differences from the first vertex keep the products far from the limits of int64.
+    # Differences from the first vertex keep the products of most polygons far from the limits of int64.
     x, y = x - x[0], y - y[0]
+    if int(np.abs(x).max()) * int(np.abs(y).max()) * 2 * len(x) >= 2**63:
+        x, y = x.astype(object), y.astype(object)
     return int(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))

@@ -39,6 +39,7 @@ OnViolation = Literal["warn", "fail", "fix"]
 # Of names of files and cells, and of the endings of cells other than those of masks ("_ORDER_DIE").
 _LONGEST_NAME, _LONGEST_ENDING = 32, 10
 _FEMTO = 10**15
+_FARTHEST = 2**31 - 1  # coordinate of a drawing, database units
 _DEEP = 0.1  # of the wafer, from where on a depth is more likely a mistake in its unit
 
 
@@ -72,7 +73,7 @@ class Order:
         material: what the wafer is made of, in words, for the run sheet.
 
     Raises:
-        InputError: floors as deep as the wafer is thick.
+        InputError: floors as deep as the wafer is thick, or a mask blank that 32-bit coordinates do not reach across.
     """
 
     rules: RulesReport
@@ -90,12 +91,18 @@ class Order:
     material: str = field(default=SILICA, metadata=IF_ANY)
 
     def __post_init__(self) -> None:
-        """Raise an InputError for floors that leave no glass below them."""
+        """Raise an InputError for floors that leave no glass below them, and for a blank that cannot be drawn."""
         deep_m, glass_m = self.level_map.levels.total_m, self.wafer.thickness_m
         if deep_m >= glass_m:
             rule = f"must be thicker than the deepest floor, {format_length(deep_m)}"
             cure = "Check the unit of the height of a level, or give the thickness of the wafer."
             raise InputError("wafer: thickness", rule, format_length(glass_m), cure)
+        most_m = 2 * _FARTHEST * self.dbu_m
+        if self.wafer.blank_m > most_m:
+            unit, most = format_length(self.dbu_m), format_length(most_m)
+            rule = f"must be at most {most} in 32-bit coordinates of {unit}, the database unit of this pitch"
+            cure = "Choose a smaller mask blank, or a pitch of whole nanometres."
+            raise InputError("wafer: blank_m", rule, format_length(self.wafer.blank_m), cure)
 
     @property
     def level_map(self) -> LevelMap:

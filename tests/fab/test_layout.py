@@ -157,5 +157,8 @@ def test_area_and_box_of_shapes():
     triangle = np.array([[0, 0], [4, 0], [0, -4]], dtype=np.int32)
     shapes = Shapes(np.array([[1, 2, 3, 5]], dtype=np.int32), (triangle,))
     assert (len(shapes), shapes.doubled_area, shapes.box) == (2, 2 * 6 + 16, (0, -4, 4, 5))
+    far = 2**31 - 1
+    wide = Shapes(np.array([[-far, -far, far, far], [-far, 0, far, 1]], dtype=np.int32))
+    assert wide.doubled_area == 2 * ((2 * far) ** 2 + 2 * far)
     nothing = Shapes(np.empty((0, 4), dtype=np.int32))
     assert (len(nothing), nothing.doubled_area, nothing.box) == (0, 0, None)

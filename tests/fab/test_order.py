@@ -233,6 +233,15 @@ def test_floors_leave_glass_below_them(level_map, caplog):
     assert "the deepest floor lies 75 um below the face of a wafer of 600 um" in caplog.text
 
 
+def test_the_blank_fits_the_coordinates(level_map):
+    """A pitch on tenths of a nanometre makes them the unit."""
+    wafer = Wafer(400e-3, blank_m=450e-3, dies=(1, 1))
+    assert plan_order(level_map, wafer=wafer).dbu_m == 1e-9
+    fine = replace(level_map, grid=replace(level_map.grid, pitch_m=1.8502e-6))
+    with pytest.raises(InputError, match=r"blank_m: must be at most 429\.\d+ mm in 32-bit coordinates of 0\.1 nm"):
+        plan_order(fine, wafer=wafer)
+
+
 @pytest.mark.parametrize("length_m", [1e300, math.inf, math.nan, 0.0, -1e-7])
 def test_lengths_that_no_drawing_has_are_refused(length_m):
     """Before anything is computed with them: their squares and sums are no numbers."""

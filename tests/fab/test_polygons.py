@@ -170,5 +170,5 @@ def test_impossible_annuli_are_refused(numbers):
 def test_area_is_exact_at_the_limit_of_the_coordinates():
     far = 2**31 - 1
     square = np.array([[-far, -far], [far, -far], [far, far], [-far, far]], dtype=np.int32)
-    # Twice this area is 2**65: the largest polygon whose doubled area still fits is a quarter of it.
     assert doubled_area(square // 2) == 2 * (2 * (far // 2) + 1) ** 2
+    assert doubled_area(square) == -doubled_area(square[::-1]) == 2 * (2 * far) ** 2  # nearly 2**65
