@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture
+from fab.aperture import Aperture, MaskAperture
 from fab.errors import InputError
 from fab.figure import html_of
 from fab.grid import Grid, fewest_pixels
@@ -242,20 +242,38 @@ def _off_grid(grid: Grid, rules: Rules) -> OffGrid:
     return OffGrid(address_m, int(np.count_nonzero(rest)), rest.size, worst / 2 / _FEMTO)
 
 
-def _windows(words: bits.Words, grid: Grid, relief: Aperture, rules: Rules, area: int) -> tuple[float, float, float]:
-    """Return the density of the aperture and of its emptiest and fullest window."""
-    overall = bits.count(words) / area if area else 0.0
-    size = max(1, round(rules.window_m / grid.pitch_m))
-    counts = bits.windows(words, grid.shape[1], size)
+def _window_pixels(grid: Grid, rules: Rules) -> int:
+    return max(1, round(rules.window_m / grid.pitch_m))
+
+
+def _whole_windows(grid: Grid, relief: Aperture, rules: Rules) -> NDArray[np.bool_]:
+    """Return which of the windows that fit side by side into the raster ``[row, column]`` lie in the relief."""
+    size = _window_pixels(grid, rules)
+    rows, columns = (n // size for n in grid.shape)
+    if isinstance(relief, MaskAperture):
+        inside = relief.inside(grid)[: rows * size, : columns * size]
+        return np.logical_and.reduce(inside.reshape(rows, size, columns, size), axis=(1, 3))
+    # Of a disc or a rectangle every quadrant is alike, and holds a window whose farthest corner it holds.
     y, x = (
         np.maximum(abs(axis[: n * size : size]), abs(axis[size - 1 : n * size : size]))
-        for axis, n in zip((grid.axis_m("y"), grid.axis_m("x")), counts.shape, strict=True)
+        for axis, n in zip((grid.axis_m("y"), grid.axis_m("x")), (rows, columns), strict=True)
     )
-    inside = counts[relief.contains(y[:, None], x[None, :])] / size**2
+    return relief.contains(y[:, None], x[None, :])
+
+
+def _densities(
+    words: bits.Words, grid: Grid, whole: NDArray[np.bool_], rules: Rules, area: int
+) -> tuple[float, float, float]:
+    """Return the density of the aperture and of its emptiest and fullest window."""
+    overall = bits.count(words) / area if area else 0.0
+    size = _window_pixels(grid, rules)
+    inside = bits.windows(words, grid.shape[1], size)[whole] / size**2
     return (overall, float(inside.min()), float(inside.max())) if inside.size else (overall, overall, overall)
 
 
-def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, relief: Aperture, area: int) -> PlaneRules:
+def _check_plane(
+    words: bits.Words, bit: int, rules: Rules, grid: Grid, whole: NDArray[np.bool_], area: int
+) -> PlaneRules:
     pitch, (ny, nx) = grid.pitch_m, grid.shape
     corner = (nx / 2, ny / 2)
     places: list[Violation] = []
@@ -297,7 +315,7 @@ def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, relief: 
         places += [place("kissing corner", x + 1, y + 1, 0, 0) for y, x, _ in listed]
     places.sort(key=lambda p: (p.size_m, -p.length_m, p.y_m, p.x_m))
     line, space = widths
-    density = _windows(words, grid, relief, rules, area)
+    density = _densities(words, grid, whole, rules, area)
     return PlaneRules(bit, line, space, int(kisses), *density, tuple(places[:_MOST_PLACES]))
 
 
@@ -317,9 +335,9 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     levels = level_map.levels
     rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
     grid, relief = level_map.grid, level_map.relief
-    area = relief.count_inside(grid)
+    area, whole = relief.count_inside(grid), _whole_windows(grid, relief, rules)
     words = bits.pack(level_map.level, levels.count)
     with ThreadPoolExecutor() as pool:
-        tasks = [pool.submit(_check_plane, w, k, rules, grid, relief, area) for k, w in enumerate(words)]
+        tasks = [pool.submit(_check_plane, w, k, rules, grid, whole, area) for k, w in enumerate(words)]
         planes = tuple(task.result() for task in tasks)
     return RulesReport(level_map, rules, planes, _off_grid(grid, rules))

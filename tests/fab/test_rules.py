@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from fab.aperture import MaskAperture
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles, smallest_runs
@@ -199,6 +200,19 @@ def test_density_of_the_aperture_and_of_its_windows():
     inside = np.count_nonzero(grid.inside_circle(80 * UM))
     assert found.density == pytest.approx(100 / inside)
     assert (found.emptiest, found.fullest) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("window", "densities"), [(20, (0.5, 0.0, 1.0)), (21, (0.5, 0.0, 1.0)), (200, (0.5, 0.5, 0.5))]
+)
+def test_windows_of_a_mask_lie_in_its_relief_wherever_that_is(window, densities):
+    """Relief in the left half, of which the lower quarter is etched all over, and the upper one not at all."""
+    grid, left, level = Grid((80, 81), UM), np.zeros((80, 81), np.uint8), np.ones((80, 81), np.uint8)
+    left[:, :42], level[:40, :42] = 1, 0
+    for flip in (np.s_[:, :], np.s_[:, ::-1], np.s_[::-1, :], np.s_[::-1, ::-1]):
+        plate = LevelMap(level[flip].copy(), TWO, grid, MaskAperture.of(left[flip], UM))
+        plane = check(plate, Rules(window_m=window * UM)).planes[0]
+        assert (plane.density, plane.emptiest, plane.fullest) == densities
 
 
 def test_a_plate_smaller_than_the_window_is_one_window():
