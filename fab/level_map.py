@@ -63,16 +63,16 @@ class LevelMap:
             rule = f"must have the grid's shape {self.grid.shape}"
             raise InputError("level map", rule, checked.shape, "Use its own grid.")
         relief = aperture_from(self.aperture)
+        if isinstance(relief, MaskAperture) and (relief.shape, relief.pitch_m) != (self.grid.shape, self.grid.pitch_m):
+            rule = f"a mask must have the raster's {self.grid.shape} pixels of {format_length(self.grid.pitch_m)}"
+            got = f"{relief.shape} of {format_length(relief.pitch_m)}"
+            raise InputError("aperture", rule, got, "Give a mask of the same raster.")
         sides = zip(relief.extent_m, self.grid.extent_m, strict=True)
         if not all(0 < side <= most * (1 + 1e-9) for side, most in sides) and relief.narrowest_m != math.inf:
             rule = f"must lie from 0 to the shorter side of the raster, {format_length(min(self.grid.extent_m))}"
             if not isinstance(relief, RoundAperture):
                 rule = f"must lie on the raster, {RectangularAperture(self.grid.extent_m)}"
             raise InputError("aperture", rule, str(relief), "Give the diameter of the relief, or its width and height.")
-        if isinstance(relief, MaskAperture) and (relief.shape, relief.pitch_m) != (self.grid.shape, self.grid.pitch_m):
-            rule = f"a mask must have the raster's {self.grid.shape} pixels of {format_length(self.grid.pitch_m)}"
-            got = f"{relief.shape} of {format_length(relief.pitch_m)}"
-            raise InputError("aperture", rule, got, "Give a mask of the same raster.")
         blank = np.where(relief.inside(self.grid), checked, np.uint8(self.levels.count - 1))
         blank.setflags(write=False)
         object.__setattr__(self, "aperture", relief)
@@ -196,7 +196,8 @@ def read_level_map(path: str | Path) -> LevelMap:
         bits = np.unpackbits(packed, axis=-1, count=nx)
         level = level_map_from_planes(bits, levels)
         aperture = math.inf if header["aperture_m"] is None else header["aperture_m"]
-        return LevelMap(level, levels, grid, aperture_from(aperture, where=f"{path}: aperture_m"), str(header["name"]))
+        relief = aperture_from(aperture, where=f"{path}: aperture_m", shape=grid.shape)
+        return LevelMap(level, levels, grid, relief, str(header["name"]))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise

@@ -19,7 +19,13 @@ from fab.errors import InputError
 __all__ = ["Aperture", "MaskAperture", "RectangularAperture", "RoundAperture", "aperture_from", "diameter_of"]
 
 
-def aperture_from(value: Any, unit_m: float = 1.0, digits: int | None = None, where: str = "aperture") -> Aperture:
+def aperture_from(
+    value: Any,
+    unit_m: float = 1.0,
+    digits: int | None = None,
+    where: str = "aperture",
+    shape: tuple[int, int] | None = None,
+) -> Aperture:
     """Return an aperture from itself, a diameter, [width, height], or the record of a mask.
 
     Args:
@@ -27,6 +33,7 @@ def aperture_from(value: Any, unit_m: float = 1.0, digits: int | None = None, wh
         unit_m: the unit, metres.
         digits: decimals of a metre to which lengths are rounded; None leaves them.
         where: what names it in messages, such as the file that it came from.
+        shape: cells ``(ny, nx)`` that the record of a mask must have, before it is unfolded; None for any.
 
     Raises:
         InputError: anything else.
@@ -34,7 +41,7 @@ def aperture_from(value: Any, unit_m: float = 1.0, digits: int | None = None, wh
     if isinstance(value, Aperture):
         return value
     if isinstance(value, dict):
-        return MaskAperture.from_record(value, unit_m, digits, where)
+        return MaskAperture.from_record(value, unit_m, digits, where, shape)
     given = value if isinstance(value, list | tuple) else [value]
     try:
         sizes = [float(size) if unit_m == 1.0 else float(size) * unit_m for size in given]

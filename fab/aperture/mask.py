@@ -178,14 +178,17 @@ class MaskAperture(Aperture):
         return {"shape": list(self.shape), "pitch": pitch, "inset": inset, "rows": rows_of(self.plane)}
 
     @classmethod
-    def from_record(cls, record: Any, unit_m: float, digits: int | None, where: str) -> "MaskAperture":
-        """Make the one of a `record`; lengths and `where` as in `fab.aperture.aperture_from`.
+    def from_record(
+        cls, record: Any, unit_m: float, digits: int | None, where: str, shape: tuple[int, int] | None = None
+    ) -> "MaskAperture":
+        """Make the one of a `record`; lengths, `where` and `shape` as in `fab.aperture.aperture_from`.
 
         Raises:
-            InputError: keys, numbers or rows that no mask has.
+            InputError: keys, numbers or rows that no mask has, or other cells than those of `shape`.
         """
         try:
             (ny, nx), rows = record["shape"], record["rows"]
+            _require_cells((ny, nx), shape)
             lengths = [float(record[key]) * unit_m for key in ("pitch", "inset")]
             pitch_m, inset_m = lengths if digits is None else (round(length, digits) for length in lengths)
             found = cls.of(plane_of(rows, (ny, nx)), pitch_m).shrunk(inset_m)
@@ -193,6 +196,13 @@ class MaskAperture(Aperture):
             got = error.got if isinstance(error, InputError) else str(error)
             raise InputError(where, "must hold shape, pitch, inset and rows of a mask", str(got)[:80], _CURE) from error
         return found
+
+
+def _require_cells(shape: tuple[Any, Any], wanted: tuple[int, int] | None) -> None:
+    """Raise a ValueError for a mask of other cells than those that are wanted, if any are."""
+    if wanted is not None and shape != wanted:
+        (ny, nx), (rows, columns) = shape, wanted
+        raise ValueError(f"one of {ny} x {nx} cells for a raster of {rows} x {columns}")
 
 
 def rows_of(plane: NDArray[np.bool_]) -> list[list[int]]:

@@ -345,5 +345,5 @@ def read_manifest(folder: str | Path) -> Manifest:
     manifest.grid()
     manifest.staircase()
     for size in (manifest.aperture_mm, manifest.chrome.opening_diameter_mm):
-        aperture_from(size, where=f"{path}: aperture")
+        aperture_from(size, where=f"{path}: aperture", shape=manifest.grid().shape)
     return manifest

@@ -62,7 +62,7 @@ def order_from(request: Mapping[str, Any], level: NDArray[np.uint8], where: str)
         asked = {name: TypeAdapter(hints[name]).validate_python(request[name]) for name in given}
         drawn = request["level_map"]
         grid = Grid(level.shape, float(drawn["pitch_m"]))
-        relief = aperture_from(drawn["aperture_m"])
+        relief = aperture_from(drawn["aperture_m"], shape=grid.shape)
         level_map = LevelMap(level, asked["process"].levels, grid, relief, drawn["name"])
     except ValidationError as errors:
         found = errors.errors(include_url=False)[0]

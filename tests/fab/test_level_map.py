@@ -12,6 +12,9 @@ from fab.height import HeightMap
 from fab.level_map import LevelMap, read_level_map, write_level_map
 from fab.levels import Levels
 
+# A few bytes that stand for gigabytes.
+WIDE_MASK = {"shape": [20000, 20000], "pitch": 1e-6, "inset": 1.5e-6, "rows": [[20000, 0, 20000]]}
+
 
 def random_map(seed: int = 0, count: int = 16, shape: tuple[int, int] = (31, 44), name: str = "some map") -> LevelMap:
     level = np.random.default_rng(seed).integers(0, count, shape).astype(np.uint8)
@@ -89,6 +92,7 @@ def test_uneven_depths_and_equal_bytes(tmp_path):
         ({"levels": 12}, "one of the 12 levels"),
         ({"pitch_m": -1.0}, "pitch"),
         ({"aperture_m": 1.0}, "shorter side"),
+        ({"aperture_m": WIDE_MASK}, "one of 20000 x 20000 cells for a raster of 31 x 44"),
         ({"etch_depths_m": "deep"}, "level map"),
     ],
 )

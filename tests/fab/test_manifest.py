@@ -6,6 +6,10 @@ from fab.aperture import diameter_of
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_bytes
 from fab.manifest.records import read_manifest
+from fab.order.verify import verify
+
+# A few bytes that stand for gigabytes.
+WIDE_MASK = {"shape": [20000, 20000], "pitch": 1e-3, "inset": 0, "rows": [[20000]]}
 
 
 def rewrite(folder, change):
@@ -49,6 +53,7 @@ def test_any_change_by_hand_is_noticed(order_folder):
         (lambda d: d.update(levels=8), "fit the levels"),
         (lambda d: d.update(shape=[3]), "fit the levels"),
         (lambda d: d.update(shape=[0, 3]), "grid"),
+        (lambda d: d.update(aperture_mm=WIDE_MASK), "one of 20000 x 20000 cells for a raster of 21 x 16"),
         (lambda d: d.update(masks={}), "masks"),
         (lambda d: d.update(preview="../../etc/passwd"), "plain name"),
         (lambda d: d.update(preview="unlisted.png"), "plain name"),
@@ -63,3 +68,9 @@ def test_what_is_no_manifest_of_an_order_is_refused(order_folder, change, messag
 def test_a_missing_manifest_is_named(tmp_path):
     with pytest.raises(InputError, match=r"manifest\.json: the file must exist"):
         read_manifest(tmp_path)
+
+
+def test_a_request_with_a_mask_of_another_raster_is_refused(order_folder):
+    rewrite(order_folder, lambda d: d["request"]["level_map"].update(aperture_m=WIDE_MASK))
+    with pytest.raises(InputError, match="one of 20000 x 20000 cells for a raster of 21 x 16"):
+        verify(order_folder)
