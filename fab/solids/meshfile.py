@@ -137,6 +137,7 @@ def write_stl(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
 _CHUNK = 1 << 20  # bytes; by itself the parser asks for two thousand at a time
 _TEXT_PER_TRIANGLE = 300  # bytes, with its share of the vertices; written are about 100
 _MOST_TRIANGLES = 1 << 24
+_MOST_ACCESSORS = 8  # two are written; normals, colours and the like have one each
 
 
 def _require_bounded(path: Path, kind: str, most: int) -> None:
@@ -154,6 +155,13 @@ def _require_bounded(path: Path, kind: str, most: int) -> None:
     counts = [each["count"] for each in value["accessors"] if each["bufferView"] >= 0 and "sparse" not in each]
     if len(counts) < len(value["accessors"]) or not all(0 <= count <= 3 * most for count in counts):
         raise ValueError(f"accessors of {counts} values, where {3 * most} are the most")
+    nodes, meshes = value["nodes"], value["meshes"]
+    # Each place of a mesh is a copy of it; a node that is placed once at most has no more copies than are counted here.
+    copies = sum("mesh" in node for node in nodes), len(meshes), sum(len(mesh["primitives"]) for mesh in meshes)
+    groups = [*value.get("scenes", ()), *nodes]
+    placed = [one for group in groups for key in ("nodes", "children") for one in group.get(key, ())]
+    if copies != (1, 1, 1) or len(set(placed)) < len(placed) or len(counts) > _MOST_ACCESSORS:
+        raise ValueError("other than one mesh of one part, which is placed once")
     if any("uri" in each for key in ("buffers", "images") for each in value.get(key, ())):
         raise ValueError("data in other files")
 

@@ -1,5 +1,6 @@
 """Small files that stand for immense things: each is refused by counting, before anything is unfolded."""
 
+import json
 import struct
 import zipfile
 from pathlib import Path
@@ -171,6 +172,31 @@ def test_a_mesh_with_data_in_other_files_is_refused(tmp_path: Path, level_map):
     elsewhere = b'"buffers":[{"uri":"a","b":'.ljust(len(here))
     (tmp_path / "a.glb").write_bytes(whole.replace(here, elsewhere))
     with pytest.raises(InputError, match="data in other files"):
+        read_mesh(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"nodes": [{"mesh": 0}] * 500, "scenes": [{"nodes": list(range(500))}]},
+        {"nodes": [{"mesh": 0}], "scenes": [{"nodes": [0] * 500}]},
+        {"nodes": [{"mesh": 0}, *({"children": [n, n]} for n in range(30))], "scenes": [{"nodes": [30]}]},
+        {"meshes": [{"primitives": [{"attributes": {"POSITION": 1}, "indices": 0}] * 500}]},
+        {"accessors": [{"bufferView": 0, "componentType": 5125, "count": 3, "type": "SCALAR"}] * 500},
+    ],
+)
+def test_a_mesh_that_is_placed_many_times_is_refused(tmp_path: Path, level_map, change):
+    write_glb(tmp_path / "a.glb", relief_mesh(reduced_cells(level_map, 10), 10 * UM))
+    data = (tmp_path / "a.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    text = json.dumps(json.loads(data[20 : 20 + length]) | change).encode()
+    text += b" " * (-len(text) % 4)
+    parts = [
+        struct.pack("<III", 0x46546C67, 2, len(data) - length + len(text)),
+        struct.pack("<II", len(text), 0x4E4F534A),
+    ]
+    (tmp_path / "a.glb").write_bytes(b"".join([*parts, text, data[20 + length :]]))
+    with pytest.raises(InputError, match="other than one mesh of one part, which is placed once"):
         read_mesh(tmp_path / "a.glb")
 
 
