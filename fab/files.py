@@ -18,6 +18,7 @@ import os
 import re
 import shutil
 import stat
+import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -310,10 +311,12 @@ def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return value
 
 
-def _non_finite(value: object, key: str = "") -> tuple[str, float] | None:
-    """Find the first NaN or infinity of a parsed JSON value, with the dotted key it stands at."""
+def _non_finite(value: object, key: str = "") -> tuple[str, object] | None:
+    """Find the first NaN, infinity or number that no float holds of a parsed JSON value, with its dotted key."""
     if isinstance(value, float):
         return None if math.isfinite(value) else (key, value)
+    if isinstance(value, int) and abs(value) > sys.float_info.max:
+        return key, f"a whole number of {len(str(abs(value)))} digits"
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     found = (_non_finite(part, f"{key}.{name}" if key else str(name)) for name, part in inner)
     return next((one for one in found if one is not None), None)
@@ -332,7 +335,7 @@ def csv_table(rows: Sequence[NamedTuple], digits: int = 9) -> str:
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
-    """Read a JSON file that holds one object; no key twice, no NaN, no infinity."""
+    """Read a JSON file that holds one object; no key twice, no NaN, no infinity, no number that no float holds."""
     cure = "Write it again from its source."
     text = read_bytes(path, 1 << 28)
     try:

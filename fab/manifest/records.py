@@ -4,6 +4,7 @@ Lengths stand here in the units of the order form (nm, um, mm), with the unit in
 depends on the time or the place, so the same inputs give the same manifest.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cache
@@ -24,6 +25,9 @@ from fab.levels import Levels
 from fab.units import MM, NM, UM
 
 FORMAT = "doedesign mask order 2"
+
+_MOST_PIXELS = 1 << 28  # of a level map that is read
+_FARTHEST_NM = 200_000  # that an edge is moved, by its mask and by a split
 
 # Nothing is converted: a number in quotes is no number.
 _STRICT = ConfigDict(strict=True, extra="forbid")
@@ -342,6 +346,13 @@ def read_manifest(folder: str | Path) -> Manifest:
     if not 1e-6 <= manifest.dbu_nm <= 1e6:
         rule, cure = "the database unit must lie from 1e-6 to 1e6 nm", "Write the order again."
         raise InputError(str(path), rule, manifest.dbu_nm, cure)
+    if max(manifest.shape) > _MOST_PIXELS or math.prod(manifest.shape) > _MOST_PIXELS:
+        rule, cure = f"the grid must have at most {_MOST_PIXELS} pixels", "Write the order again."
+        raise InputError(str(path), rule, f"shape {manifest.shape}", cure)
+    for move_nm in (one.edge_move_nm for layers in manifest.drawn().values() for one in layers):
+        if not abs(move_nm) <= _FARTHEST_NM:
+            rule, cure = f"edges must be moved by at most {_FARTHEST_NM} nm", "Write the order again."
+            raise InputError(str(path), rule, move_nm, cure)
     manifest.grid()
     manifest.staircase()
     for size in (manifest.aperture_mm, manifest.chrome.opening_diameter_mm):

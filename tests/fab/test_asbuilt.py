@@ -108,6 +108,7 @@ def test_edges_are_half_of_what_lines_grew_and_gaps_lost(tmp_path):
         ("mask 1/depth_nm", "75", "must be a number"),
         ("mask 1/depth_nm", True, "must be a number"),
         ("mask 1/depth_nm", float("nan"), "must be a finite number"),
+        ("mask 1/depth_nm", 10**400, "must be a finite number"),
         ("mask 1/depth_by_pad_nm/20 um", -75, "must lie between"),
         ("mask 1/depth_by_pad_nm", 75, "group of blanks"),
         ("mask 2/overlay_x_um", 500, "must lie between"),

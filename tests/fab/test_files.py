@@ -253,6 +253,7 @@ def test_read_json_refuses_what_is_no_object(tmp_path, content):
         ('{"a": 1, "a": 2}', "the key 'a' stands twice"),
         ('{"a": {"b": NaN}}', "a.b: must be a finite number"),
         ('{"a": -Infinity}', "a: must be a finite number"),
+        (f'{{"a": [1, -1{400 * "0"}]}}', "a.1: must be a finite number, but got a whole number of 401 digits"),
         ('{"a": ' + "[" * 100_000, "brackets without end"),
         ('{"a": ' + "1" * 5000 + "}", "4300 digits"),
     ],
