@@ -193,7 +193,7 @@ def _bare(part: Part) -> Box:
 def _to_square(sector: NDArray[np.int32], square: int) -> NDArray[np.int32]:
     """Return what lies between the outer arc of a sector and a centred square around it, of half the edge."""
     radius = np.hypot(*sector.T.astype(np.float64))
-    arc = sector[radius > radius.mean()].astype(np.float64)
+    arc = sector[radius > radius.max() - 2].astype(np.float64)
     first, last = (np.rint(point * (square / np.abs(point).max())) for point in (arc[0], arc[-1]))
     corner = np.copysign(square, arc[0] + arc[-1])
     between = [corner] if not np.any(np.all([first == corner, last == corner], axis=1)) and _within(corner, arc) else []

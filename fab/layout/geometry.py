@@ -34,6 +34,8 @@ _UNITS_FM = (1000_000, 500_000, 250_000, 200_000, 100_000)
 _LIMIT = 2**31 - 1
 # Width of the square frame around an opening that is not round.
 _FRAME_M = 100 * UM
+# Between the chrome's outer circle and what lies within it, some of the largest database units.
+_CLEAR_M = 5 * NM
 
 # x0, y0, x1, y1
 Box = tuple[int, int, int, int]
@@ -190,7 +192,8 @@ class Chrome:
     Attributes:
         overlap_m: how far the chrome reaches over the edge of the relief, metres, so that it stays covered
             when the chrome is aligned a little off.
-        outer_m: outer radius, metres; by default the corners of the raster and half a millimetre more.
+        outer_m: outer radius, metres, 5 nm and more beyond the opening, or the square frame of one that is not round
+            and the chord error; by default the corners of the raster and half a millimetre more.
         chord_error_m: largest distance between the circles and their chords, metres.
     """
 
@@ -212,10 +215,12 @@ class Chrome:
         extent_m, reach_m = level_map.grid.extent_m, opening.reach_m
         if not isinstance(opening, RoundAperture):  # there is a square frame around it
             extent_m = (max(extent_m), max(extent_m))
-            reach_m = math.sqrt(2) * (opening.widest_m / 2 + _FRAME_M)
+            # Its corners lie within the chords of the circle.
+            reach_m = math.sqrt(2) * (opening.widest_m / 2 + _FRAME_M) + max(0.0, self.chord_error_m)
         if outer is None:
             # Whole tenths of a millimetre, because this number stands on the order form.
             outer = (np.ceil((np.hypot(*extent_m) / 2 + 0.5 * MM) / (0.1 * MM) - 1e-9)) * 0.1 * MM
+        reach_m += _CLEAR_M
         if not reach_m < outer < float("inf"):
             rule, got = f"must exceed what the opening needs, {format_length(reach_m)}", format_length(outer)
             raise InputError("chrome outer radius", rule, got, "Choose a larger one.")

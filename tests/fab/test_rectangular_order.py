@@ -16,16 +16,18 @@ from fab.errors import InputError
 from fab.gds.reader import read_gds
 from fab.gds.writer import write_gds
 from fab.grid import Grid
-from fab.layout.geometry import Layer, Shapes
+from fab.layout.geometry import Chrome, Layer, Shapes
 from fab.layout.polygons import MAX_VERTICES, frame_around_box, sectors_around_square
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
+from fab.order.drawing import draw
 from fab.order.order import plan_order
 from fab.order.verify import verify
 from fab.order.write import write_planned
 from fab.runsheet.as_built import read_as_built
 from fab.solids.step import step_bodies
+from fab.verification.shop_checks import drawing_problems
 from tests.fab.maps import FEW, PLAIN
 from tests.fab.mended import mend, restate, told
 from tests.fab.parts import chrome_of_dies, marks_window_um
@@ -77,6 +79,30 @@ def test_sectors_around_a_rectangle_leave_exactly_it(half_x, half_y, outer, chor
     assert region.area() + 4 * half_x * half_y == pytest.approx(circle, abs=2 * math.pi * outer * (chord + 1))
     with pytest.raises(ValueError, match="around the square"):
         sectors_around_square(half, math.floor(math.hypot(half, half)), chord)
+
+
+REACH_M = math.sqrt(2) * (35 * UM + 100 * UM)  # of the corners of the frame
+
+
+@pytest.mark.parametrize(
+    ("outer_m", "chord_error_m"),
+    [(1.0001 * REACH_M, 5e-9), (1.001 * REACH_M, 5e-9), (REACH_M + 14e-9, 5e-9), (1.06 * REACH_M, 1e-5)],
+)
+def test_chrome_that_ends_near_its_frame_reaches_the_edges_of_the_die(outer_m, chord_error_m):
+    order = plan_order(slit(), chrome=Chrome(outer_m=outer_m, chord_error_m=chord_error_m), wafer=FEW)
+    drawn = draw(order)
+    assert list(drawing_problems(drawn.layout, order.wafer.blank_m)) == []
+    (die,) = (cell for cell in drawn.layout.cells if cell.name == f"{order.stem}_DIE")
+    around, doe = (next(s for layer, s in c.shapes.items() if layer == Layer(5)) for c in (die, drawn.does[0]))
+    area_m2 = (around.doubled_area + doe.doubled_area) / 2 * order.dbu_m**2
+    bare_m2 = sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in drawn.frame.bare_m)
+    opening_m2 = OPENING_UM[0] * OPENING_UM[1] * UM**2
+    assert area_m2 == pytest.approx(drawn.frame.die_m**2 - opening_m2 - bare_m2, abs=1e-15)
+
+
+def test_chrome_that_ends_at_its_frame_is_refused():
+    with pytest.raises(InputError, match="chrome outer radius: must exceed what the opening needs"):
+        plan_order(slit(), chrome=Chrome(outer_m=REACH_M + 9e-9)).chrome.rim_m(slit())
 
 
 def test_another_library_sees_the_rectangle_where_it_should_be(written):
