@@ -45,6 +45,7 @@ _ALL_CORNERS = 6  # errors up to which every combination of signs is tried
 NOMINAL, EXPECTED = "nominal", "expected"
 DEFECTS, _ROUGHNESS = "defects", "roughness"
 _REACHES = (-1.0, 1.0)
+_MOST_ROWS = 1 << 20  # of a Sobol sequence, which is made as a whole
 
 
 def varying(process: Process) -> tuple[str, ...]:
@@ -239,7 +240,7 @@ def variation_at(process: Process, seed: int, plate_m: float, key: str) -> Varia
             case ["corners", index]:
                 return draw_at(process, corner_scores(process)[_index(index)], seed)
             case ["one_at_a_time", name, reach]:
-                scores = one_at_a_time_scores(process, (float(reach),))
+                scores = one_at_a_time_scores(process, (_finite(reach),))
                 return draw_at(process, scores[varying(process).index(name)], seed)
             case ["sobol", half, index]:
                 return _sobol_draw(process, seed, plate_m, half, _index(index))
@@ -259,8 +260,17 @@ def _index(text: str) -> int:
     return int(text)
 
 
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
 def _sobol_draw(process: Process, seed: int, plate_m: float, half: str, index: int) -> Variation:
     names = varying(process)
+    if index >= _MOST_ROWS:
+        raise ValueError(index)
     row = sobol_scores(2 * len(names), max(index, 1).bit_length(), seed)[index]
     first, second = row[: len(names)], row[len(names) :]
     # Rare events and the roughness of the two samples are those of an even and of an odd Monte-Carlo draw.

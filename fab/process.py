@@ -121,11 +121,11 @@ class Process:
 
     def __post_init__(self) -> None:
         masks = tuple(range(self.levels.bits))
-        if not self.order:
-            object.__setattr__(self, "order", tuple(sorted(masks, key=self.levels.etch_depth_m)))
-        if tuple(sorted(self.order)) != masks:
+        order = tuple(self.order) or tuple(sorted(masks, key=self.levels.etch_depth_m))
+        if tuple(sorted(order)) != masks:
             rule = f"must name each of the masks 0 to {len(masks) - 1} once"
-            raise InputError("process: order", rule, self.order, "List every mask.")
+            raise InputError("process: order", rule, order, "List every mask.")
+        object.__setattr__(self, "order", tuple(int(mask) for mask in order))  # of numpy, they would not go into JSON
         # A copy, and a plain dictionary, because a read-only view of one cannot be sent to another process.
         object.__setattr__(self, "spreads", dict(self.spreads))
         self._check_spreads()

@@ -65,6 +65,9 @@ class Wafer:
             if not 0 < getattr(self, name) < 1:
                 got = format_length(getattr(self, name))
                 raise InputError(f"wafer: {name}", "must be positive and below 1 m", got, "Check its unit.")
+        if self.pitch_m is not None and not 0 < self.pitch_m < 1:
+            rule, got = "must be positive and below 1 m", format_length(self.pitch_m)
+            raise InputError("wafer: pitch_m", rule, got, "Check its unit, or leave it out.")
         if self.chrome not in ("liftoff", "etch"):  # another word would change the tone of its photomask
             raise InputError("wafer: chrome", 'must be "liftoff" or "etch"', repr(self.chrome), "Choose one of them.")
         if self.blank_m < self.diameter_m:

@@ -73,6 +73,8 @@ class OrderTerms:
             raise InputError(
                 "order: quantity", "must be a whole number, 1 or more", self.quantity, "Leave it out if it is open."
             )
+        if self.quantity is not None:
+            object.__setattr__(self, "quantity", int(self.quantity))  # of numpy, it would not go into JSON
         if self.defects_per_cm2 is not None and not 0 <= self.defects_per_cm2 < 1e6:
             got = self.defects_per_cm2
             raise InputError("order: defects_per_cm2", "must be 0 or more, below a million", got, "Check it.")

@@ -3,12 +3,15 @@
 import csv
 import io
 import re
+from dataclasses import asdict
+from typing import Any
 
 import klayout.db as kdb
+import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.files import sha256_file
+from fab.files import canonical_json, sha256_file
 from fab.manifest.records import read_manifest
 from fab.order.form import SHARED, form_csv
 from fab.order.terms import OrderTerms
@@ -87,3 +90,8 @@ def test_what_was_said_stands_in_every_row():
 def test_impossible_terms_are_refused(terms, where):
     with pytest.raises(InputError, match=re.escape(f"order: {where}")):
         OrderTerms(**terms)
+
+
+def test_a_quantity_of_numpy_goes_into_json():
+    copies: Any = np.int64(2)
+    assert canonical_json(asdict(OrderTerms(quantity=copies))) == canonical_json(asdict(OrderTerms(quantity=2)))

@@ -1,7 +1,9 @@
 import dataclasses
 import math
 import pickle
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -123,6 +125,13 @@ def test_a_process_can_be_hashed_and_sent_to_another_process_and_keeps_its_own_n
 def test_impossible_processes_are_refused(changes: dict, message: str):
     with pytest.raises(InputError, match=message):
         Process(SIXTEEN, **changes)
+
+
+@pytest.mark.parametrize("order", [[2, 0, 1, 3], np.array([2, 0, 1, 3])])
+def test_an_order_is_a_tuple_of_whole_numbers(order: Any):
+    process = Process(SIXTEEN, order=order)
+    assert process == Process(SIXTEEN, order=(2, 0, 1, 3))
+    assert [type(mask) for mask in process.order] == [int] * 4
 
 
 def test_means_below_zero_are_for_errors_that_go_both_ways():
