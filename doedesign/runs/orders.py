@@ -33,8 +33,8 @@ def order_of_run(name: str, folder: Path | None, level_map: LevelMap | None, hom
         homes: where the folder of orders may lie, the first one first.
     """
     places = [place for home in homes for place in _places(home / MASKS, name, folder)]
-    # A released model lies among the orders and has a manifest of its own.
-    there = [place for place in places if (place / MANIFEST_NAME).is_file() and not _is_same(place, folder)]
+    # A released run lies among the orders and has a manifest of its own.
+    there = [place for place in places if (place / MANIFEST_NAME).is_file() and not (place / LEVEL_MAP).is_file()]
     own = (place for place in there if level_map is None or is_order_of(place, level_map))
     return next(own, None) or next(iter(there), places[0])
 
@@ -205,10 +205,6 @@ def _same_source(manifest: Manifest, level_map: LevelMap, origin: Mapping[str, A
 
 def _is_empty(folder: Path) -> bool:
     return folder.is_dir() and not any(folder.iterdir())
-
-
-def _is_same(place: Path, folder: Path | None) -> bool:
-    return folder is not None and place.resolve() == folder.resolve()
 
 
 def _alike(manifest: Manifest, level_map: LevelMap) -> bool:

@@ -276,3 +276,6 @@ def test_a_run_that_lies_among_the_orders_is_not_taken_for_one(work: Path):
     assert order_of_run("small", released, own_level_map(released)) == Path("masks/small")
     (work / "masks" / "small").rename(work / "masks" / "other")
     assert order_of_run("small", released, own_level_map(released)) == Path("masks/small")
+    # Nor for that of the run of the same name that it was released from.
+    run = Path("runs/coarse")
+    assert order_of_run("small", run, own_level_map(run)) == Path("masks/small")
