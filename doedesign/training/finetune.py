@@ -34,6 +34,7 @@ from doedesign.runtime.compiling import compiled_step
 from doedesign.runtime.stopping import stoppable
 from doedesign.spec import load_spec
 from doedesign.spec.training import TrainSpec
+from doedesign.spec.values import MOST_STEPS
 from doedesign.training.job import TrainingJob, perceptual_distance, trained_model
 from doedesign.training.joint import rates_at
 from doedesign.training.loss import adam_step, history_line, losses
@@ -144,7 +145,7 @@ def _options(model: Model, steps: int, learning_rate: float | None, seed: int) -
     before = load_spec(path).train if path is not None and path.is_file() else TrainSpec()
     rate = before.learning_rate / 10 if learning_rate is None else learning_rate
     for name, fits, rule, value in (
-        ("steps", 0 <= steps <= 10_000_000, "must be from 0 to 10 million", steps),
+        ("steps", 0 <= steps <= MOST_STEPS, "must be from 0 to 10 million", steps),
         ("learning_rate", 0 < rate < np.inf, "must be positive", rate),
         ("seed", 0 <= seed < 2**32, "must be from 0 to 2^32 - 1", seed),
     ):
