@@ -20,7 +20,8 @@ from doedesign.areas.target import AreaTarget, camera_for
 from doedesign.areas.transport import transport_phase
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
-from doedesign.design.lbfgs import finite_loss, lbfgs_memory, lbfgs_step
+from doedesign.design.lbfgs import lbfgs_memory, lbfgs_step
+from doedesign.design.problem import finite_loss
 from doedesign.spec import Spec, input_files
 from doedesign.spots.superposition import Staircase
 from fab.errors import InputError

@@ -1,14 +1,11 @@
 """Steps of L-BFGS with a line search, for loss functions that are cheap enough to be called several times a step."""
 
 from collections.abc import Callable
-from math import isfinite
 from typing import Any
 
 import jax
 import optax
 from jaxtyping import Array
-
-from fab.errors import InputError
 
 _MOST_TRIES = 12  # of a line search
 
@@ -40,22 +37,6 @@ def lbfgs_step(loss: Callable[[Array], Array], parameters: Array, memory: Any, s
     updates, memory = optimiser.update(gradient, memory, parameters, value=value, grad=gradient, value_fn=loss)
     moved: Any = optax.apply_updates(parameters, updates)
     return moved, memory, value
-
-
-def finite_loss(loss: Array, step: int, cure: str) -> float:
-    """Return the loss of a step as a number.
-
-    Args:
-        loss: a scalar.
-        step: number of the step, for messages.
-        cure: what a user can do.
-
-    Raises:
-        InputError: a loss that is not finite.
-    """
-    if not isfinite(value := float(loss)):
-        raise InputError(f"optimize, step {step}", "the loss must stay finite", value, cure)
-    return value
 
 
 def _optimiser(steps: int) -> optax.GradientTransformationExtraArgs:

@@ -36,7 +36,7 @@ from doedesign.design.levels.etch_depths import height_histogram, optimal_levels
 from doedesign.design.levels.parametrize import LevelParametrization, Parameters
 from doedesign.design.levels.printable import PrintableLevels, first_printed, moved_phases
 from doedesign.design.levels.quantisation import Rounding, rounding_at
-from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, value_and_slope
+from doedesign.design.problem import Problem, SourceSet, StepSources, finite_loss, judge_height, value_and_slope
 from doedesign.design.robust import RobustState, RobustTask
 from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
@@ -261,10 +261,13 @@ def steps(
             (parameters, adam), loss, terms, wanted = printed_update((problem, inputs[1], height), before)
             printed = rules.nearer(level, np.asarray(wanted))
             state = state._replace(parameters=parameters, adam=adam, step=step + 1, printed=printed)
-        if not np.isfinite(float(loss)):
-            cure = "Lower optimize.learning_rate." if step else "Lower the weight of an objective."
-            raise InputError(f"optimize, step {step}", "the loss must stay finite", float(loss), cure)
-        record = {"step": step, "loss": float(loss), "terms": [float(term) for term in terms], "names": names}
+        cure = "Lower optimize.learning_rate." if step else "Lower the weight of an objective."
+        record = {
+            "step": step,
+            "loss": finite_loss(loss, step, cure),
+            "terms": [float(term) for term in terms],
+            "names": names,
+        }
         yield state, record
     if spec.robust is None:
         return

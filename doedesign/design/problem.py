@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial, reduce
+from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from doedesign.design.levels.parametrize import LevelParametrization
 from doedesign.design.objectives import Objective, PsfSet, Term, disc_radii_m, terms_from_spec
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec
+from fab.errors import InputError
 from fab.levels import Levels
 from sim.camera import Camera, SpectralLine
 from sim.metrics import participation
@@ -234,6 +236,22 @@ def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
         tuple(tuple(_energy(optic, one) for one in depths) for depths in side) for side in _asked(problem, look)
     )
     return _view((near, far), problem.camera, look)
+
+
+def finite_loss(loss: Array, step: int, cure: str) -> float:
+    """Return the loss of a step as a number.
+
+    Args:
+        loss: a scalar.
+        step: number of the step, for messages.
+        cure: what a user can do.
+
+    Raises:
+        InputError: a loss that is not finite.
+    """
+    if not isfinite(value := float(loss)):
+        raise InputError(f"optimize, step {step}", "the loss must stay finite", value, cure)
+    return value
 
 
 def losses(terms: tuple[Term, ...], view: PsfSet) -> tuple[Array, Array]:

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int
 
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
-from doedesign.design.lbfgs import finite_loss, lbfgs_memory, lbfgs_step
+from doedesign.design.lbfgs import lbfgs_memory, lbfgs_step
+from doedesign.design.problem import finite_loss
 from doedesign.focus.foci import Foci
 from doedesign.focus.problem import FINER, FocusLight, FocusProblem, ring_count, ring_numbers
 from doedesign.spec import Spec

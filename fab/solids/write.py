@@ -40,8 +40,9 @@ def write_models(folder: Path, stem: str, model: DoeModel) -> list[ModelEntry]:
     """Write every kind of file that a DOE has into a folder; return their entries (`model_entries`)."""
     entries = model_entries(folder, stem, model)
     for entry in entries:
-        if kind := _kind(entry):
-            kind.write(folder / entry.file, model)
+        kind = _kind(entry)
+        assert kind is not None  # the entries are made of the kinds there are
+        kind.write(folder / entry.file, model)
     return entries
 
 

@@ -61,8 +61,7 @@ class DirectPath(eqx.Module):
 def _in_parts(field: Complex[Array, "y x"], incident: Complex[Array, "y x"], parts: int) -> Complex[Array, "fy fx"]:
     """The field of `parts` by `parts` samples of every cell, over which the incident wave goes on as to its neighbours.
 
-    Held at its value in the middle, the wave of a near source would be a staircase: for half a wave per cell at the rim
-    a third of the light went astray.
+    Held at its value in the middle, the wave of a near source would be a staircase, which sends light astray.
     """
     offset = (np.arange(parts) + 0.5) / parts - 0.5
     along_y, along_x = (_waves_per_cell(incident, axis)[:, None, :, None] for axis in (0, 1))
@@ -90,7 +89,7 @@ def plan_direct(
 ) -> DirectPath:
     """Prepare the direct path of one wavelength; phases are formed in float64 and wrapped before float32.
 
-    It serves sources at every depth; without a lens those at `depth_m` (metres) and beyond to the accuracy below.
+    It serves sources at every depth; without a lens it has samples enough for those at `depth_m` (metres) and beyond.
 
     The lens is the thin one of eq. 5, which has a mapping of its own: near that of tangents, with aberrations of the
     order of angle⁴. An InputError for a camera that asks for another, where eq. 6 does not hold, or where the window
