@@ -75,8 +75,10 @@ def _angle_text(value: Any, kind: HeldAngle) -> str:
     """Write places that are held as sines as angles, with as few digits as are read back to them."""
     if isinstance(value, tuple):
         return f"[{', '.join(_angle_text(item, kind) for item in value)}]"
-    texts = [f"{math.degrees(kind.angle(value)):.{digits}g} deg" for digits in range(4, 16)]
-    return f'"{next((text for text in texts if kind.held(parse_angle(text)) == value), texts[-1])}"'
+    angle_rad = kind.angle(value)
+    texts = (f"{math.degrees(angle_rad):.{digits}g} deg" for digits in range(4, 16))
+    # An angle that was given in other units may be none of these; in radians every digit counts.
+    return f'"{next((text for text in texts if kind.held(parse_angle(text)) == value), f"{angle_rad!r} rad")}"'
 
 
 def toml_value(name: str, value: Any) -> str:

@@ -96,6 +96,16 @@ def test_a_spec_is_written_in_angles_and_read_as_the_same(tmp_path: Path, table:
     assert spec_from_json(json.loads(json.dumps(spec_to_json(spec))), "again") == spec
 
 
+@pytest.mark.parametrize("angle", ["7.431723 mrad", "6.516 mrad", "0.0123456789 rad", "0.1 mrad"])
+def test_a_pixel_in_other_units_than_degrees_is_read_as_the_same(tmp_path: Path, angle: str):
+    """No 15 digits in degrees give the first two back: a run would not know its own spec again."""
+    spec = spec_of(tmp_path, GRID, f"sensor.pixel_angle={angle}", "sensor.window=16")
+    (tmp_path / "again.toml").write_text(spec_to_toml(spec))
+    again = load_spec(tmp_path / "again.toml")
+    assert again.sensor.pixel_angle_rad == spec.sensor.pixel_angle_rad
+    assert again == spec
+
+
 @pytest.mark.slow
 def test_an_area_in_degrees_is_that_of_a_lens(tmp_path: Path):
     """1 mm at f is the same plate as 2 asin(1 mm / 2 f); and its light has half its value where the angle says.
