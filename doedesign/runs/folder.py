@@ -337,7 +337,7 @@ def open_run(folder: Path) -> Run:
             raise InputError(str(folder / name), "must be the file this run wrote", "a changed file", cure)
     if spec.process.chooses_depths:  # from now on as if the depths that it chose had been given
         process = spec_to_json(spec)["process"] | {_DEPTHS: manifest.etch_depths_m}
-        spec = spec_from_json(spec_to_json(spec) | {"process": process}, str(folder / MANIFEST_NAME))
+        spec = spec_from_json(spec_to_json(spec) | {"process": process}, str(folder / MANIFEST_NAME), path)
     return Run(folder, spec, done=True, aim_depths_m=manifest.aim_depths_m)
 
 

@@ -111,9 +111,20 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
     return spec
 
 
-def spec_from_json(data: Mapping[str, Any], source: str) -> Spec:
-    """Rebuild a spec from the JSON object that `spec_to_json` returned; `source` names it in messages."""
-    return _checked(Spec, data, source, si=True)
+def spec_from_json(data: Mapping[str, Any], source: str, file: Path | None = None) -> Spec:
+    """Rebuild a spec from the JSON object that `spec_to_json` returned.
+
+    Args:
+        data: the object.
+        source: what messages call it.
+        file: the spec's file, to which the paths in it are relative.
+
+    Raises:
+        InputError: it breaks a rule.
+    """
+    spec = _checked(Spec, data, source, si=True)
+    spec._file = file  # pyright: ignore[reportAttributeAccessIssue]
+    return spec
 
 
 def load_process(path: str | Path, levels: Levels | None = None) -> ProcessSpec:

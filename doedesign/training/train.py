@@ -223,7 +223,7 @@ def _with_options(design: Design, options: Mapping[str, Any]) -> tuple[Design, S
     spec = design.spec
     if options:
         tables = spec_to_json(spec)
-        spec = spec_from_json({**tables, "train": {**tables.get("train", {}), **options}}, "train")
+        spec = spec_from_json({**tables, "train": {**tables.get("train", {}), **options}}, "train", spec.file)
     size = training_size(spec)
     if size != spec.train.size:
         _log.info("training pictures of %d pixels per side, what the sensor has", size)

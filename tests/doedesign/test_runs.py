@@ -152,6 +152,23 @@ def test_a_run_that_is_killed_while_it_begins_goes_on(tmp_path: Path, monkeypatc
     assert {name: run.path(name).read_bytes() for name in kept} == kept
 
 
+def test_a_run_that_chose_its_depths_still_has_its_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """They lie in its folder, wherever a command is called, and not where it is called."""
+    (tmp_path / "beam.png").write_bytes(b"a beam")
+    (tmp_path / "quick.toml").write_text(QUICK.read_text("utf-8"), "utf-8")
+    beam = "illumination={ kind = 'picture', picture = 'beam.png', pixel = '2 um' }"
+    plain = ["scene={ far = ['inf'] }", "objective=[{ name = 'far_spot' }]", "process.etch_depths=optimize"]
+    spec = load_spec(tmp_path / "quick.toml", [beam, *plain])
+    with claim_run(tmp_path / "run", spec, {}) as run:
+        begin_run(run)
+        finish_run(run, [], [spec.process.depth_m(mask) for mask in range(spec.process.masks)])
+    (tmp_path / "beam.png").unlink()
+    monkeypatch.chdir(tmp_path)
+    found = open_run(Path("run")).spec
+    assert not found.process.chooses_depths
+    assert input_files(found) == {"illumination.picture": Path("run/illumination_picture.png")}
+
+
 def test_equal_specs_are_the_same_however_written(run: Run):
     with claim_run(run.folder, load_spec(QUICK, ["optics.focal_length=0.1 cm"]), {}) as claimed:
         assert claimed.spec == run.spec
