@@ -30,6 +30,8 @@ _BEAM_KEYS = {
     "point": (("distance_m",), ()),
 }
 
+_SAME_DEPTH = 1e-9  # relative
+
 
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
@@ -195,6 +197,11 @@ def _scene(spec: Spec) -> Iterator[InputError]:
             rule += "or the cells cannot follow the wave of the source"
             cure = "Move the source away or choose a finer pitch for the same aperture."
             yield InputError(key, rule, format_length(min(depths)), cure)
+        # Banks name a PSF by its depth, to twelve digits; no two PSFs differ for less.
+        for index, depth_m in enumerate(depths):
+            if any(math.isclose(depth_m, other, rel_tol=_SAME_DEPTH) for other in depths[:index]):
+                rule, cure = "every depth must be given once", "Leave one of them out."
+                yield InputError(f"{key}[{index}]", rule, f"{format_length(depth_m)} twice", cure)
 
 
 def shortest_m(spec: Spec) -> float:

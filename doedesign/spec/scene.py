@@ -51,8 +51,8 @@ class SceneSpec(SpecTable, frozen=True):
     """Where light comes from, measured from the plate.
 
     Attributes:
-        near_m: depths of the obstruction; may be empty where no objective looks at it.
-        far_m: depths of the scene behind it; "inf" in TOML for a star.
+        near_m: depths of the obstruction, each once; may be empty where no objective looks at it.
+        far_m: depths of the scene behind it, each once; "inf" in TOML for a star.
         occlusion: how an obstruction takes light from what lies behind it (`sim.imaging.occlusion`): "radiometric"
             follows the light and leaves the PSF its shape, "reciprocal" lets a shadow change that, "paper" is eq. 10,
             "paper_release" what the paper's public code does.
