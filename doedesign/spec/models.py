@@ -108,7 +108,10 @@ class ColourSpec(SpecTable, frozen=True):
             raise broken(f"must have one entry per wavelength, {count} here", "Add or remove weights.")
         total = sum(weights)
         # Weights that already sum to 1 stay untouched, so that reading a spec twice changes no digit.
-        return weights if abs(total - 1) < 1e-12 else tuple(weight / total for weight in weights)
+        shares = weights if abs(total - 1) < 1e-12 else tuple(weight / total for weight in weights)
+        if not all(part > 0 for part in shares):
+            raise broken("must be numbers whose shares of their sum are above 0", "Choose numbers nearer to 1.")
+        return shares
 
 
 class OpticsSpec(SpecTable, frozen=True):

@@ -111,6 +111,14 @@ def test_colour_tables_complete_and_normalise_their_weights(edited: Callable[...
     assert [(c.name, c.weights) for c in spec.optics.colours] == [("red", (0.25, 0.75)), ("green", (0.5, 0.5))]
 
 
+@pytest.mark.parametrize("weights", ["[1e308, 1e308]", "[1e-200, 1e200]"])
+def test_weights_without_shares_of_their_sum_are_refused(weights: str, edited: Callable[..., Path]):
+    """Their sum is infinite, or one is nothing beside it: the colour would be dark, and its spec not read again."""
+    colours = f'colours = [{{ name = "red", wavelengths = ["640 nm", "656 nm"], weights = {weights} }}]'
+    path = edited(('wavelengths = ["656 nm", "589 nm", "486 nm"]', colours))
+    assert "optics.colours[0].weights: must be numbers whose shares of their sum are above 0" in refusal(path)
+
+
 @given(weights=st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=6))
 def test_reading_weights_again_changes_no_digit(weights: list[float]):
     table = [{"name": "white", "wavelengths_m": [500e-9 + 1e-9 * i for i in range(len(weights))], "weights": weights}]
