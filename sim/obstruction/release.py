@@ -24,6 +24,7 @@ from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
 _LEAST_PX = 4  # pixels of a cell; of finer ones the tile is larger than memory
+_MESHES = (8, 14)  # of the release's fences, in wires
 _CELLS = 8  # noise cells along each side of the release's tile
 _CELL_M = 64 * 3.7e-6 * 0.12 / 8e-3  # their width on the glass: 64 pixels of 3.7 um at 12 cm behind 8 mm
 
@@ -133,11 +134,14 @@ class ReleaseFence(WithLimits):
     wire_m: Range = (5e-3, 15e-3)  # diameter of a wire; 5 to 15 mm
 
     name: ClassVar[str] = "release_fence"
-    limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M, "wire_m": (1e-5, 0.1)}
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+        "wire_m": (Fence.limits["mesh_m"][0] / _MESHES[0], 0.1),
+    }
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Draw one fence."""
-        wire_m, mesh = draw_from(rng, self.wire_m), rng.uniform(8, 14)
+        wire_m, mesh = draw_from(rng, self.wire_m), rng.uniform(*_MESHES)
         fence = Fence(
             depth_m=self.depth_m,
             wire_m=(wire_m, wire_m),

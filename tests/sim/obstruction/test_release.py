@@ -94,6 +94,15 @@ def test_what_cannot_be_meant_is_refused(kind: type[ReleaseDirt]):
         kind(depth_m=(0.0, 0.1))
 
 
+@pytest.mark.parametrize("edge", [0, 1])
+def test_a_release_fence_of_any_wire_can_be_drawn(rng: np.random.Generator, edge: int):
+    """At both limits, whatever mesh it gets: 60 of them come near to both ends."""
+    view, wire_m = CameraView((16, 16), 3.7e-6, 8e-3), ReleaseFence.limits["wire_m"][edge]
+    background = np.zeros((3, 16, 16), np.float32)
+    for _ in range(60):
+        assert ReleaseFence(wire_m=(wire_m, wire_m)).draw(rng, view, background).mask.shape == (16, 16)
+
+
 def test_release_dirt_is_not_finer_than_the_pixels(rng: np.random.Generator):
     """Far away its tile would not fit into memory."""
     view = CameraView((64, 64), 3.7e-6, 8e-3)
