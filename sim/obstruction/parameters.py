@@ -1,6 +1,6 @@
 """Parameters of obstructions: ranges that a value is drawn from, their limits, and the way to draw."""
 
-import math
+import sys
 from collections.abc import Mapping
 from numbers import Integral, Real
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -78,5 +78,5 @@ def _told(parameter: str, value: Any) -> str:
 
 
 def is_number(value: Any, kind: type = Real) -> bool:
-    """Whether a value is a finite number of a kind; true and false are none."""
-    return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether a value is a finite number of a kind, which a float holds; true and false are none."""
+    return isinstance(value, kind) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

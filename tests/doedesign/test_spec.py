@@ -269,6 +269,7 @@ REFUSED = [
     ("optimize.learning_rate", "nan", ["optimize.learning_rate", "must be finite"]),
     ("optimize.start", '"rings"', ["optimize.start", "a known start or a height map file", "Did you mean `ring`?"]),
     ("optimize.start_options", "{a = {b = 1}}", ["optimize.start_options", "lists of these"]),
+    ("optimize.start_options", f"{{a = 1{'0' * 400}}}", ["optimize.start_options", "finite numbers"]),
     ("objective", "[]", ["objective", "must have something to improve", "no [[objective]]"]),
     ("objective", "{}", ["objective", "must be a list", "Write [[objective]] tables."]),
     ("objective.0.name", '"far_spott"', ["objective[0].name", "a known objective", "Did you mean `far_spot`?"]),

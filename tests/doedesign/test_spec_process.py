@@ -532,6 +532,7 @@ def test_a_nominal_plate_is_an_empty_table(written: Callable[..., Path]):
         ('[variation]\nsidewall = "-1 deg"', ["variation.sidewall: must be finite and not negative"]),
         ("[variation]\netch_lag = -1", ["variation.etch_lag: must be finite and not negative"]),
         ("[variation]\netch_lag = inf", ["variation.etch_lag: must be finite"]),
+        (f"[variation]\ndepth_scale = [1{'0' * 400}]", ["variation.depth_scale[0]: must be a number"]),
         ("[variation]\nrepeats = [-2]", ["variation.repeats[0]: must be at least -1"]),
         (
             '[variation]\ndepth_scale = [0.1, 0.1]\noverlay_x = ["1 um"]',

@@ -7,6 +7,7 @@ The validation context tells which of the two is read: `FROM_TOML`, or none for 
 import json
 import math
 import re
+import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -98,7 +99,7 @@ def _read(unit: str, value: Any, context: Any) -> float:
     """A quantity as text with a unit in TOML, as a number in SI units otherwise."""
     plural, parse, _ = UNITS[unit]
     if not from_toml(context):
-        if isinstance(value, int | float) and not isinstance(value, bool):
+        if _is_number(value):
             return float(value)
         raise broken(f"must be a number of {plural}", "Give a number.")
     try:
@@ -108,6 +109,13 @@ def _read(unit: str, value: Any, context: Any) -> float:
     number, _, name = value.strip().partition(" ")
     # `parse` rounds to fifteen digits because of prefixes; without a prefix every digit counts.
     return float(number) if name.strip() == unit else parsed
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that a float holds, finite or not: TOML has whole numbers of any length."""
+    if isinstance(value, int):
+        return not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, float)
 
 
 def from_toml(context: Any) -> bool:
@@ -260,7 +268,7 @@ def share(low: float, high: float) -> Within:
     """Return the validator of a plain number between two bounds, such as a fraction."""
 
     def validate(value: Any) -> float:
-        number = isinstance(value, int | float) and not isinstance(value, bool)
+        number = _is_number(value)
         if not (number and low <= value <= high):
             raise broken(_range_rule(low, high, "{:g}".format) if number else "must be a number", "Write 5 % as 0.05.")
         return float(value)
@@ -330,8 +338,7 @@ class Options(Mapping[str, Any]):
 def _frozen_option(key: str, value: Any) -> Any:
     if isinstance(value, list | tuple):
         return tuple(_frozen_option(key, item) for item in value)
-    finite = not isinstance(value, float) or math.isfinite(value)
-    if not (isinstance(value, str | bool | int | float) and finite):
+    if not (isinstance(value, str | bool) or (_is_number(value) and math.isfinite(value))):
         rule = "must hold text, finite numbers, true, false, or lists of these"
         raise broken(rule, f"Change `{key} = {value}`.")
     return value

@@ -144,7 +144,7 @@ def test_shares_end_at_one(kind: Any):
 @pytest.mark.parametrize("kind", [kind for name, kind in OBSTRUCTIONS.items() if name != "folder"])
 @pytest.mark.usefixtures("annotations_unchecked")
 def test_a_parameter_is_of_its_kind(kind: Any):
-    """A range is no number, a number is no range, and neither is text or NaN."""
+    """A range is no number, a number is no range, and neither is text, NaN or what no float holds."""
     usual = kind()
     for name in kind.limits:
         given = getattr(usual, name)
@@ -152,7 +152,7 @@ def test_a_parameter_is_of_its_kind(kind: Any):
         wrong: list[Any] = [middle, (middle,)] if isinstance(given, tuple) else [(middle, middle)]
         if isinstance(given, int):
             wrong.append(given + 0.5)
-        for value in (*wrong, "1", None, True, np.nan, (np.nan, np.nan)):
+        for value in (*wrong, "1", None, True, np.nan, (np.nan, np.nan), 10**400, (0, 10**400)):
             with pytest.raises(InputError, match=f"{kind.name}: {name}: must be (two|a whole|a) number"):
                 kind(**{name: value})
 
