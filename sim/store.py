@@ -272,9 +272,12 @@ def _bank_description(
         sines = "pixel_sine" in described
         key = "pixel_sine" if sines else "pixel_m"
         pixel = described[key]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         rule = "must list colours, depths_m, pixel_m or pixel_sine, and field_rad"
         raise InputError(f"{path}: {_BANK}", rule, f'"{error!r}"', "Write the file again.") from error
+    if not np.isfinite((y, x)).all():
+        rule = "must have a field_rad of two finite angles"
+        raise InputError(f"{path}: {_BANK}", rule, f"{y} and {x}", "Write the file again.")
     if not colours or not all(depth > 0 for depth in depths) or not depths:
         rule = "needs at least one colour and depths above 0"
         raise InputError(f"{path}: {_BANK}", rule, f"{colours} and {depths}", "Write the file again.")
@@ -296,7 +299,7 @@ def _length(path: str | Path, key: str, text: object) -> float:
     """A positive, finite length in metres."""
     try:
         value = float(text)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         value = np.nan
     if not 0 < value < np.inf:
         raise InputError(f"{path}: {key}", "must be a positive length in metres", repr(text), "Correct it.")

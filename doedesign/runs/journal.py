@@ -163,7 +163,7 @@ def _read(path: Path, lines: Lines) -> dict[str, Any]:
         try:
             key, found = lines.decode(_whole(line))
         # What a damaged line lacks shows in different ways.
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             cure = f"Remove {path} to compute all {lines.noun}s again."
             raise InputError(
                 f"{path}, line {number}", f"must be one finished {lines.noun}", f'"{error}"', cure

@@ -32,7 +32,8 @@ def results_folder(
         return
     folder = Path(folder)
     if (folder / MANIFEST_NAME).is_file():
-        listed = {MANIFEST_NAME, *read_json(folder / MANIFEST_NAME).get("results_sha256", ())}
+        digests_before = read_json(folder / MANIFEST_NAME).get("results_sha256")
+        listed = {MANIFEST_NAME, *(digests_before if isinstance(digests_before, dict) else ())}
         for path in sorted(folder.iterdir()):
             if path.name not in listed:
                 rule = "a folder of results that is replaced must hold nothing else"

@@ -1,9 +1,11 @@
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -184,6 +186,26 @@ def test_wrong_content_is_named(tmp_path: Path):
     write_foreign(tmp_path / "m.exr", {"Y": heights()})
     with pytest.raises(InputError, match="pixel pitch of a PSF from another program must be given"):
         read_bank(tmp_path / "m.exr")
+
+
+@pytest.mark.parametrize(
+    "described",
+    [
+        "[" * 100_000,
+        {"depths_m": [10**400]},
+        {"pixel_m": 10**400},
+        {"pixel_sine": 10**400},
+        {"field_rad": ["nan", "0"]},
+        {"field_rad": ["0", "inf"]},
+        {"field_rad": [10**400, 0]},
+    ],
+)
+def test_a_bank_that_describes_itself_by_no_numbers_is_refused(tmp_path: Path, described: Any):
+    usual = {"colours": ["red"], "depths_m": ["1"], "pixel_m": "1e-6", "field_rad": ["0", "0"]}
+    text = described if isinstance(described, str) else json.dumps(usual | described)
+    write_foreign(tmp_path / "b.exr", {"z1000mm.red": heights()}, psf_bank=text)
+    with pytest.raises(InputError, match=r"b\.exr: psf_bank.*must (list colours|be a positive|have a field_rad)"):
+        read_bank(tmp_path / "b.exr")
 
 
 def test_heights_of_another_program_may_lack_their_lengths(tmp_path: Path):
