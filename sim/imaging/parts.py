@@ -234,6 +234,8 @@ def spread_by_disc(
     # Coverage of every pixel from 8 x 8 points.
     points = (np.arange(8 * (2 * half + 1)) + 0.5) / 8 - (2 * half + 1) / 2
     disc = (np.hypot(points[:, None], points) <= radius).reshape(2 * half + 1, 8, 2 * half + 1, 8).mean(axis=(1, 3))
+    if not disc.any():  # narrower than the points are apart
+        disc[half, half] = 1.0
     padded = np.pad(light, [(0, 0)] * (light.ndim - 2) + [(half, half)] * 2, mode="edge")
     kernel = np.broadcast_to(disc / disc.sum(), (*light.shape[:-2], *disc.shape))
     spread = scipy.signal.fftconvolve(padded, kernel, mode="valid", axes=(-2, -1))

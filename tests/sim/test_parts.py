@@ -116,6 +116,14 @@ def test_an_even_layer_stays_even_and_a_small_one_keeps_its_light():
     assert found[1, 1] == pytest.approx(64 / (np.pi / 4 * 160**2), rel=0.02)
 
 
+def test_a_disc_far_smaller_than_a_pixel_leaves_its_light_there():
+    """It lies between the points that stand for a pixel's area: light of the obstruction was NaN."""
+    layer = np.zeros((5, 5))
+    layer[2, 2] = 1.0
+    found = spread_by_disc(layer, 0.5, 8.0, (1, 1))
+    assert found == pytest.approx(1.0, rel=1e-6)  # a sum by transforms in double precision, rounded to single
+
+
 def test_a_window_without_a_middle_is_refused():
     from dataclasses import replace
 
