@@ -55,7 +55,7 @@ def read_any_height(
     Args:
         path: the file.
         pitch_m: pixel pitch, metres; needed unless the file holds it (EXR of our own).
-        scale_m: metres per count, for integers.
+        scale_m: metres per count, for integers, or per 1 for floats that are not metres.
         aperture: outline of the relief, its diameter in metres, or the name of a picture of it; by default what the
             file says, or its shorter side.
     """
@@ -72,7 +72,12 @@ def read_any_height(
     pitch_m = stored.pitch_m if pitch_m is None else pitch_m
     if pitch_m is None:
         raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Give the pitch of a pixel.")
-    ny, nx = stored.height_m.shape
+    height_m = stored.height_m
+    if scale_m is not None:
+        if not 0 < scale_m < np.inf:
+            raise InputError(str(path), "the scale must be positive and finite", scale_m, "Give metres per count.")
+        height_m = height_m * np.float32(scale_m)
+    ny, nx = height_m.shape
     grid = Grid((ny, nx), pitch_m)
     outline = outline_of(stored.height_m, grid, stored.aperture if aperture is None else aperture, str(path))
     return HeightMap(stored.height_m, grid, outline)
@@ -176,7 +181,7 @@ def drawing_from(
         step_m: height of one level, metres; for a bare height map, like the rest.
         etch_depths_m: depth of every mask where it is not 2^k steps, first mask first, metres.
         pitch_m: pixel pitch, metres.
-        scale_m: metres per count, for integers.
+        scale_m: metres per count, for integers, or per 1 for floats that are not metres.
         aperture_m: diameter of the relief, or its width and height, metres; or the name of a picture of it
             (`fab.aperture.picture`).
 

@@ -103,3 +103,15 @@ def test_messages_name_the_file(tmp_path: Path):
     np.save(tmp_path / "high.npy", np.full((4, 4), 1e-3))
     with pytest.raises(InputError, match=r"high\.npy: no height may lie more than half a step above"):
         drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)
+def test_heights_of_an_exr_that_are_not_metres_have_a_scale(tmp_path: Path):
+    """As those of other files of floats do."""
+    write_height(tmp_path / "plate.exr", np.full((4, 4), 500.0), 2e-6, 8e-6)
+    np.save(tmp_path / "plate.npy", np.full((4, 4), 500.0))
+    for name in ("plate.exr", "plate.npy"):
+        found = read_any_height(tmp_path / name, pitch_m=2e-6, scale_m=1e-9)
+        np.testing.assert_allclose(found.height_m, 500e-9, rtol=1e-6)  # float32
+        for scale_m in (0.0, -1e-9):
+            with pytest.raises(InputError, match="scale must be positive"):
+                read_any_height(tmp_path / name, pitch_m=2e-6, scale_m=scale_m)
+
+
