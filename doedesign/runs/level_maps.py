@@ -79,8 +79,8 @@ def read_any_height(
         height_m = height_m * np.float32(scale_m)
     ny, nx = height_m.shape
     grid = Grid((ny, nx), pitch_m)
-    outline = outline_of(stored.height_m, grid, stored.aperture if aperture is None else aperture, str(path))
-    return HeightMap(stored.height_m, grid, outline)
+    outline = outline_of(height_m, grid, stored.aperture if aperture is None else aperture, str(path))
+    return HeightMap(height_m, grid, outline)
 
 
 def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
@@ -115,7 +115,8 @@ def open_design(
         source: the run, or its folder; a design is returned as it is.
         masks: its mask order, whose files are read; `masks/NAME` where there is one, else the run's own level map;
             False for that in any case.
-        levels: another number of levels; mask orders are then left aside.
+        levels: a number of levels; mask orders are then left aside and, with another number than the run's own, so is
+            what its masks do against the errors of its process.
         overrides: changes to the spec that the design does not depend on, "table.key=value".
         free: tables of the spec that may be changed; of the sensor, only its response to light.
 
@@ -129,12 +130,13 @@ def open_design(
     folder = Path(masks) if masks else None
     if masks is None and levels is None:
         folder = own_order(run.spec.name, run.folder, level_map)
-    moves_m = run.spec.wafer.edge_moves_m if levels is None else ()
+    redrawn = levels not in (None, levels_from_spec(run.spec.process).count)
+    moves_m = () if redrawn else run.spec.wafer.edge_moves_m
     if levels is None and folder is not None:
         level_map = level_map.with_level(drawn_in_masks(folder, level_map))
         moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
     continuous, aim = run.path(CONTINUOUS), None
-    if run.aim_depths_m and levels is None:
+    if run.aim_depths_m and not redrawn:
         own = level_map.levels
         aim = replace(level_map, levels=Levels(own.count, own.step_m, run.aim_depths_m))
     return Design(

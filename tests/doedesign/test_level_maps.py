@@ -1,5 +1,6 @@
 """Where height maps come from: files of any kind, and runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from doedesign.build import camera_from_spec
 from doedesign.design.design import Design
-from doedesign.runs.folder import Run, begin_run, claim_run, finish_run
+from doedesign.runs.folder import Run, begin_run, claim_run, finish_run, open_run
 from doedesign.runs.level_maps import drawing_from, level_map_of_run, read_any_height, write_design
 from doedesign.spec import load_spec
 from fab.aperture import RoundAperture
@@ -72,6 +73,22 @@ def test_a_continuous_run_is_rounded_when_it_is_drawn(tmp_path: Path, continuous
     np.testing.assert_allclose(kept, continuous_m, rtol=1e-6)  # float32, and not rounded
 
 
+def test_the_own_number_of_levels_changes_nothing(tmp_path: Path, continuous_m: np.ndarray):
+    """Masks against the errors of a process are these masks with `--levels 16`, too; with others they are not."""
+    run = finished(tmp_path, continuous_m, 'wafer.edge_moves=["0.1 um", "0.1 um", "0 um", "0 um"]')
+    depths_m = tuple(1.01 * depth for depth in Levels(16, STEP_M).depths_m)
+    run = replace(open_run(run.folder), aim_depths_m=depths_m)
+    for count in (None, 16):
+        design = drawing_from(run, count).design
+        assert design is not None
+        assert design.edge_moves_m == (1e-7, 1e-7, 0.0, 0.0)
+        assert design.aim is not None
+        assert design.aim.levels.depths_m == depths_m
+    design = drawing_from(run, 8).design
+    assert design is not None
+    assert (design.edge_moves_m, design.aim) == ((), None)
+
+
 @pytest.mark.parametrize("count", [0, -8, 1, 65, 128])
 def test_impossible_levels(tmp_path: Path, continuous_m: np.ndarray, count: int):
     run = finished(tmp_path, continuous_m)
@@ -94,15 +111,6 @@ def test_what_an_exr_does_not_say_must_be_given(tmp_path: Path):
             read_any_height(path, **wrong)
 
 
-def test_a_folder_is_no_height_map(tmp_path: Path):
-    with pytest.raises(InputError, match="a height map is a file"):
-        read_any_height(tmp_path)
-
-
-def test_messages_name_the_file(tmp_path: Path):
-    np.save(tmp_path / "high.npy", np.full((4, 4), 1e-3))
-    with pytest.raises(InputError, match=r"high\.npy: no height may lie more than half a step above"):
-        drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)
 def test_heights_of_an_exr_that_are_not_metres_have_a_scale(tmp_path: Path):
     """As those of other files of floats do."""
     write_height(tmp_path / "plate.exr", np.full((4, 4), 500.0), 2e-6, 8e-6)
@@ -115,3 +123,12 @@ def test_heights_of_an_exr_that_are_not_metres_have_a_scale(tmp_path: Path):
                 read_any_height(tmp_path / name, pitch_m=2e-6, scale_m=scale_m)
 
 
+def test_a_folder_is_no_height_map(tmp_path: Path):
+    with pytest.raises(InputError, match="a height map is a file"):
+        read_any_height(tmp_path)
+
+
+def test_messages_name_the_file(tmp_path: Path):
+    np.save(tmp_path / "high.npy", np.full((4, 4), 1e-3))
+    with pytest.raises(InputError, match=r"high\.npy: no height may lie more than half a step above"):
+        drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)
