@@ -147,6 +147,18 @@ def test_infinite_depth_survives_json():
     assert spec_from_json(spec_to_json(spec), "test").scene.far_m == (5.0, math.inf)
 
 
+@pytest.mark.parametrize("far", ['["5 m", "inf"]', '["5 m", inf]'])
+def test_an_infinite_depth_needs_no_quotes(far: str):
+    """The quotes of a value may be left out, and TOML then has a number."""
+    spec = load_spec(
+        AUTOMOTIVE, [f"scene.far={far}", 'limit=[{ quantity = "strehl", min = 0.1 }]', "limit[0].depth=inf"]
+    )
+    assert spec.scene.far_m == (5.0, math.inf)
+    assert spec.limits[0].depth_m == math.inf
+    with pytest.raises(InputError, match=r"scene\.near\[0\]: must be a number with a unit"):
+        load_spec(AUTOMOTIVE, ["scene.near=[inf]"])
+
+
 def test_options_are_an_immutable_table():
     spec = load_spec(AUTOMOTIVE, ["optimize.start_options={radius=3, parts=[1, [2.5, 'a']], on=true}"])
     options = spec.optimize.start_options
