@@ -1,6 +1,6 @@
 """The optimisation problem of a spec: from parameters to the loss of one step, ready to differentiate."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial, reduce
 from math import isfinite
@@ -178,9 +178,22 @@ def plans_of(spec: Spec) -> Problem:
             round((optimize.drawn_pixel_m or spec.doe.pitch_m) / spec.doe.pitch_m),
         ),
         terms=(),
-        plans=tuple(optic.plan(line, np.inf, propagation, sampling) for line in optic.lines),
+        plans=tuple(
+            optic.plan(line, _planned_m(optic, propagation, depths_m), propagation, sampling) for line in optic.lines
+        ),
         optic=optic,
     )
+
+
+def _planned_m(optic: Any, propagation: str | None, depths_m: Sequence[float]) -> float:
+    """The depth that one plan for all depths is made for.
+
+    Samples enough for the nearest source on the direct path are enough for all; in the far field the cells' sinc stays
+    about the axis if depths differ.
+    """
+    if (propagation or optic.camera.propagation) != "far_field":
+        return min(depths_m, default=np.inf)
+    return depths_m[0] if len(depths_m) == 1 else np.inf
 
 
 Images = tuple[tuple[tuple[Array, ...], ...], tuple[tuple[Array, ...], ...]]
