@@ -31,7 +31,7 @@ from fab.errors import InputError
 from fab.files import sha256_file
 from sim.metrics import mean_wavelength_m
 from sim.psf_bank import PsfBank
-from sim.store import read_bank
+from sim.store import is_own_bank, read_bank
 
 RELEASED = Path("masks/released")
 
@@ -265,7 +265,9 @@ class Model:
             )
             raise InputError(str(path), rule, f"{sides[1]} x {sides[0]} pixels", cure)
         count = len(self.colours)
-        if set(bank.colours) == set(self.colours) and len(bank.colours) == count:
+        # Colours may have the names that files of other programs give theirs: a CSV of responses may say R, G and B.
+        foreign = depth_m is not None and len(bank.depths_m) == 1 and not is_own_bank(path)
+        if set(bank.colours) == set(self.colours) and len(bank.colours) == count and not foreign:
             order = [bank.colours.index(name) for name in self.colours]
             return PsfBank(bank.energy[order], self.colours, bank.depths_m, bank.pixel_m, bank.field_rad)
         measured = depth_m is not None and len(bank.depths_m) == 1

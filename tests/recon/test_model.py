@@ -15,6 +15,8 @@ from fab.errors import InputError
 from fab.grid import Grid
 from sim.camera import Camera, Colour
 from sim.light import srgb_from_linear
+from sim.psf_bank import PsfBank
+from sim.store import write_bank, write_picture
 from tests.recon.drawn_networks import drawn
 from tests.recon.test_reconstruct import COLOURS, PIXEL, WAVES, bank
 
@@ -95,3 +97,23 @@ def test_a_reconstruction_draws_and_saves_itself(model: Model, light: np.ndarray
     found.save(tmp_path / "a.png")
     again = srgb_from_linear(read_capture(tmp_path / "a.png").light)
     np.testing.assert_allclose(again, np.clip(found.picture, 0, 1), atol=1e-4)
+
+
+@pytest.mark.parametrize("names", [("R", "G", "B"), ("Y",)])
+def test_a_measured_psf_is_known_by_its_file_and_not_by_its_names(tmp_path: Path, names: tuple[str, ...]):
+    """Colours of a camera may be called as those of other programs' files are; counts are scaled all the same."""
+    count = len(names)
+    own, waves = bank(COLOURS[:count]), tuple(reversed(WAVES))[:count]
+    layout = replace(LAYOUT, colours=count, width=3)
+    model = Model(drawn(layout, 0.1), replace(own, colours=names), names, waves, PIXEL, (0.05, 0.12))
+    counts = np.random.default_rng(2).uniform(0, 4000, (count, 9, 9))
+    write_picture(tmp_path / "counts.exr", dict(zip(names, counts, strict=True)))
+    found = model.psfs([tmp_path / "counts.exr"] * 2, pixel_m=PIXEL)
+    # Sums of 81 numbers in single precision.
+    np.testing.assert_allclose(found.far.sum(axis=(1, 2)), model.psfs().far.sum(axis=(1, 2)), rtol=1e-5)
+    np.testing.assert_allclose(found.far / found.far[:, :1, :1], counts / counts[:, :1, :1], rtol=1e-5)
+    # A bank of our own has its energy, also of one depth.
+    alone = PsfBank(own.energy[:, :1], names, (0.05,), PIXEL)
+    write_bank(tmp_path / "near.exr", alone)
+    found = model.psfs([tmp_path / "counts.exr", tmp_path / "near.exr"], pixel_m=PIXEL, near_m=0.05)
+    np.testing.assert_array_equal(found.near[:, 1:-1, 1:-1], alone.energy[:, 0])
