@@ -29,6 +29,8 @@ from sim.store import read_picture, write_picture
 WRITTEN_FILES = (".png", ".tif", ".tiff", ".exr")
 PHOTO_FILES = (*WRITTEN_FILES, *RAW_FILES)
 
+_LIGHT = ("clean", "conventional", "capture")  # of the pictures of `simulate`
+
 _CURE = "Save it again from its source as one picture, grey or in red, green and blue."
 
 
@@ -49,7 +51,8 @@ def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
 
     Args:
         path: one of `PHOTO_FILES`.
-        linear: whether PNG and TIFF hold linear light; by default what is usual for their kind (see above).
+        linear: whether PNG and TIFF hold linear light; by default what is usual for their kind (see above). In a PNG of
+            `simulate` a count of linear light is what its manifest says.
 
     Raises:
         InputError: the file is missing, of another kind, broken, no single picture of one or three colours, or holds
@@ -62,19 +65,20 @@ def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
         raise InputError(str(path), rule, suffix or "no suffix", cure)
     stored = _described(path) if suffix in (".png", ".exr") else None
     if suffix == ".exr":
-        return _finite(Photo(_exr_light(path), None, True, str(path)))
-    if stored is not None and linear is None:
-        return _finite(Photo(read_image(path.parent, stored), 16, True, str(path)))
+        return finite(Photo(_exr_light(path), None, True, str(path)))
+    if stored is not None and linear is not False:  # linear it is; what a count is, the manifest says
+        return finite(Photo(read_image(path.parent, stored), 16, True, str(path)))
     if suffix in RAW_FILES:
-        return _finite(Photo(_raw_light(path), 16, True, str(path)))
+        return finite(Photo(_raw_light(path), 16, True, str(path)))
     return photo_from_array(read_pixels(path), linear, str(path))
 
 
-def _finite(photo: Photo) -> Photo:
-    finite = np.isfinite(photo.light)
-    if not finite.all():
-        row, column = (int(i) for i in np.argwhere(~finite.all(axis=0))[0])
-        got = f"NaN or infinity at row {row} from below, column {column} ({int((~finite).sum())} such values)"
+def finite(photo: Photo) -> Photo:
+    """Return a photo as it is; an InputError where it holds values that are not finite."""
+    whole = np.isfinite(photo.light)
+    if not whole.all():
+        row, column = (int(i) for i in np.argwhere(~whole.all(axis=0))[0])
+        got = f"NaN or infinity at row {row} from below, column {column} ({int((~whole).sum())} such values)"
         raise InputError(photo.name, "every pixel must be finite", got, "Repair those pixels, or save it again.")
     return photo
 
@@ -113,10 +117,11 @@ def _described(path: Path) -> dict[str, Any] | None:
     manifest = read_json(path.parent / MANIFEST_NAME)
     if not str(manifest.get("format", "")).startswith("doedesign simulation") or "images" not in manifest:
         return None
-    stored = next((one for one in manifest["images"].values() if one.get("file") == path.name), None)
-    if stored is None:
+    named = next(((name, one) for name, one in manifest["images"].items() if one.get("file") == path.name), None)
+    if named is None:
         return None
-    if stored["channels"] not in (["R", "G", "B"], ["Y"]):
+    name, stored = named
+    if name not in _LIGHT:  # a share of light may have its channels, too
         rule = "a capture must be a picture of light"
         raise InputError(str(path), rule, stored["what"], "Give `capture` or `conventional` of that folder.")
     if path.is_file() and manifest.get("sha256", {}).get(path.name) != sha256_file(path):
@@ -150,7 +155,7 @@ def photo_from_array(values: Num[np.ndarray, "..."], linear: bool | None = None,
     if values.dtype.kind == "f":
         light = planes.astype(np.float32)
         stays = linear is not False
-        return _finite(Photo(np.ascontiguousarray(light if stays else linear_from_srgb(light)), None, stays, name))
+        return finite(Photo(np.ascontiguousarray(light if stays else linear_from_srgb(light)), None, stays, name))
     bits = 8 * values.dtype.itemsize
     # A table of what every count means is shorter than any picture.
     table = np.arange(2**bits) / (2**bits - 1)

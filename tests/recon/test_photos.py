@@ -103,7 +103,7 @@ def simulated(folder: Path, *, png_files: bool = True) -> dict[str, Path]:
     rng = np.random.default_rng(0)
     stored = {
         name: write_image(folder, name, rng.uniform(0, 1.2, (len(c), 6, 8)), c, name, png=png_files, full_scale=1.25)
-        for name, c in {"capture": ("R", "G", "B"), "mask": ("M",)}.items()
+        for name, c in {"capture": ("R", "G", "B"), "mask": ("M",), "alpha": ("R", "G", "B")}.items()
     }
     described = {
         "format": "doedesign simulation 1",
@@ -120,6 +120,9 @@ def test_simulated_counts_mean_what_their_manifest_says(tmp_path: Path):
     photo = read_capture(path)
     assert (photo.bits, photo.linear) == (16, True)
     np.testing.assert_allclose(photo.light, expected, atol=0.51 * 1.25 / 65535)  # half a count, and single precision
+    # Said to be linear, counts mean the same; said to be display values, they are.
+    np.testing.assert_array_equal(read_capture(path, linear=True).light, photo.light)
+    assert not read_capture(path, linear=False).linear
     copied = tmp_path / "elsewhere" / "capture.png"
     copied.parent.mkdir()
     copied.write_bytes(path.read_bytes())
@@ -135,6 +138,8 @@ def test_of_a_simulation_only_light_is_taken(tmp_path: Path, png_files: bool):
     assert read_capture(paths["capture"]).light.shape == (3, 6, 8)
     with pytest.raises(InputError, match="a capture must be a picture of light, but got mask"):
         read_capture(paths["mask"])
+    with pytest.raises(InputError, match="a capture must be a picture of light, but got alpha"):
+        read_capture(paths["alpha"])
     paths["capture"].write_bytes(paths["mask"].read_bytes())
     with pytest.raises(InputError, match="must be what its manifest describes"):
         read_capture(paths["capture"])
