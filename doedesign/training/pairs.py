@@ -27,7 +27,7 @@ from jaxtyping import Float
 
 from doedesign.capture.scenes import Batch, batches_ahead, epoch_order
 from doedesign.recon.model import Model
-from doedesign.recon.photos import PHOTO_FILES, read_capture
+from doedesign.recon.photos import PHOTO_FILES, Photo, finite, read_capture
 from doedesign.training.validation import Split
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, sha256_bytes, sha256_file
@@ -163,7 +163,7 @@ def _covered(path: Path) -> Float[np.ndarray, "y x"]:
     if path.suffix.lower() == ".exr":
         channels, _ = read_picture(path)
         if set(channels) == {"M"}:
-            return channels["M"]
+            return finite(Photo(channels["M"][None], None, True, str(path))).light[0]
     # A share of a pixel follows no curve. Colours of a mask are all the same.
     return read_capture(path, linear=True).light.mean(axis=0)
 

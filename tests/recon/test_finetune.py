@@ -399,6 +399,9 @@ def change(pairs: Path, folder: Path, kind: str) -> None:
         write_reconstruction(folder / "4_mask.png", np.ones((1, 20, 20), np.float32), 8)
     elif kind == "nan":
         write_picture(folder / "1_capture.exr", {"Y": np.full((37, 44), np.nan)})
+    elif kind == "mask nan":
+        (folder / "4_mask.png").unlink(missing_ok=True)
+        write_picture(folder / "4_mask.exr", {"M": np.full((40, 44), np.nan)})
     elif kind == "small":
         for part in ("reference", "capture"):
             write_reconstruction(folder / f"0_{part}.png", scene(0, (12, 44)), 16)
@@ -418,6 +421,7 @@ def change(pairs: Path, folder: Path, kind: str) -> None:
         ("sizes", ["4_reference.png: must have the 44 x 40 pixels of 4_capture.exr, but got 44 x 36"]),
         ("mask size", ["4_mask.png: must have the 44 x 40 pixels"]),
         ("nan", ["1_capture.exr", "every pixel must be finite"]),
+        ("mask nan", ["4_mask.exr: every pixel must be finite"]),
         ("small", ["at least 16 x 16 pixels", "44 x 12"]),
         ("none", ["must hold pairs", "NAME_capture.png"]),
         ("gone", ["gone: the file must exist"]),
