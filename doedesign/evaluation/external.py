@@ -98,7 +98,7 @@ def run_program(method: ExternalMethod, given: Path, found: Path) -> None:
     words = [_with(word, places) for word in method.command]
     where, cure = f"method {method.name}", "Try the command by itself on that folder."
     try:
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
     except OSError as error:
         got = f'"{error.strerror or error}"'
         raise InputError(where, f"{words[0]} must be a program that can be run", got, "Correct it.") from error

@@ -6,7 +6,8 @@ for the Wiener filter, which takes a picture for periodic; by three half windows
 takes it for dark outside, so that even light comes out even to 1 % after its 30 iterations. A PSF that loses light is
 brought to unit energy, and the capture with it.
 
-Inpainting fills the occluded region (the sharp mask, at least half of a pixel blocked) and leaves the rest alone.
+Inpainting fills the occluded region (the sharp mask, at least half of a pixel blocked) and leaves the rest alone. Where
+that is the whole picture, there is nothing to fill it from, and it stays black.
 
 References:
     W. H. Richardson, JOSA 62 (1972); L. B. Lucy, Astron. J. 79 (1974). F. Orieux, J.-F. Giovannelli and T. Rodet,
@@ -115,6 +116,8 @@ def biharmonic(given: MethodInputs) -> Picture:
     from skimage.restoration import inpaint_biharmonic
 
     shown = np.clip(as_seen(given), 0, 1)
+    if given.hole.all():
+        return np.zeros_like(shown)
     return inpaint_biharmonic(shown, given.hole, channel_axis=0).astype(np.float32)
 
 
@@ -143,6 +146,8 @@ def _by_opencv(given: MethodInputs, name: str) -> Picture:
         cure = 'Install it with: pip install "doedesign[evaluation]"'
         raise InputError("method", "Telea and Navier-Stokes inpainting are OpenCV's", "no OpenCV here", cure) from error
     shown = np.round(255 * np.clip(as_seen(given), 0, 1)).astype(np.uint8)
+    if given.hole.all():  # OpenCV would return what it was given, a scene that nobody sees
+        return np.zeros(shown.shape, np.float32)
     hole, flag = given.hole.astype(np.uint8), getattr(cv2, name)
     found = np.stack([cv2.inpaint(np.ascontiguousarray(one), hole, _RADIUS_PX, flag) for one in shown])
     return found.astype(np.float32) / 255

@@ -280,6 +280,14 @@ def test_inpainting_fills_the_hole_and_leaves_the_rest(inputs: MethodInputs, nam
     assert np.abs(METHODS[name](even) - srgb_from_linear(np.full(1, 0.25))).max() < 0.01
 
 
+@pytest.mark.parametrize("name", ["biharmonic", "telea", "navier_stokes"])
+def test_nothing_is_found_in_a_picture_that_is_all_hole(inputs: MethodInputs, name: str):
+    """A clump may cover a whole capture: what is behind it is not handed back as if it had been found."""
+    if name != "biharmonic":
+        pytest.importorskip("cv2")
+    assert not METHODS[name](inputs._replace(mask=np.ones((64, 64), np.float32))).any()
+
+
 # Rows.
 
 
@@ -610,6 +618,10 @@ def test_a_program_is_found_out(run: Path, tmp_path: Path):
         evaluate(run, out, pairs=2, methods=["x=/nowhere/x {in} {out}"], workers=0)
     with pytest.raises(InputError, match=r"must write 0000.png for every pair"):
         evaluate(run, out, pairs=2, methods=[f"x={sys.executable} -c pass {{in}} {{out}}"], workers=0)
+    # What it says in an encoding of its own is no reason for a traceback.
+    says = "import sys; sys.stderr.buffer.write(bytes([255])); sys.exit(3)"
+    with pytest.raises(InputError, match=r"method x: must end without an error, but got exit code 3: \ufffd"):
+        evaluate(run, out, pairs=1, methods=[f'x={sys.executable} -c "{says}" {{in}} {{out}}'], workers=0)
     small = (
         "import sys,imageio,numpy;[imageio.imwrite(f'{sys.argv[2]}/000{k}.png',numpy.zeros((8,8,3),'u1'))for k in(0,1)]"
     )
