@@ -238,6 +238,7 @@ def trained_lamp_network(
         network, about = read_lamp_network(folder / LAMP_NETWORK_NAME)
         if about.get("owner") != owner:
             _refuse(folder)
+        (folder / _CHECKPOINT).unlink(missing_ok=True)  # it was killed just before
         return network
     examples = _examples(folder, made, {"how": {"examples": how.examples}, **settings})
     if len(examples.truth) < how.batch:
@@ -287,7 +288,7 @@ def _examples(folder: Path, made: Callable[[], LampExamples], settings: dict[str
         write_archive(path, {"format": FORMAT, "owner": owner}, arrays)
         return found
     header, arrays = read_archive(path, "set of examples", _CURE)
-    if header.get("owner") != owner:
+    if header.get("owner") != owner or arrays.keys() != {*LampView._fields, "truth", "saturated"}:
         _refuse(folder)
     return LampExamples(LampView(*(arrays[name] for name in LampView._fields)), arrays["truth"], arrays["saturated"])
 
@@ -319,6 +320,17 @@ def read_lamp_network(path: Path) -> tuple[LampNetwork, dict[str, Any]]:
     header, arrays = read_archive(path, "network for lamps", _CURE)
     if header.get("format") != FORMAT:
         raise InputError(str(path), f"must be of format {FORMAT!r}", repr(header.get("format")), _CURE)
-    layout = header["layout"]
-    empty = LampNetwork.make(0, layout["colours"], layout["width"])
-    return with_arrays(path, empty, arrays), header["about"]
+    layout, about, weights = header.get("layout"), header.get("about"), sum(array.size for array in arrays.values())
+    colours, width = (layout.get(key) if isinstance(layout, dict) else None for key in ("colours", "width"))
+    # A network to compare with is made before anything else, and must not be much larger than the file.
+    if not all(type(n) is int and n > 0 for n in (colours, width)) or not _fits(colours, width, weights):
+        rule, cure = "the layout must be one that this version knows", "Use the version that wrote it."
+        raise InputError(str(path), rule, f"{layout!r} for {weights} weights", cure)
+    if not isinstance(about, dict):
+        raise InputError(str(path), "must say what it is about", repr(about), _CURE)
+    return with_arrays(path, eqx.filter_eval_shape(LampNetwork.make, 0, colours, width), arrays), about
+
+
+def _fits(colours: Any, width: Any, weights: int) -> bool:
+    """Whether so many weights can be those of a network: its first block and its coarsest have some."""
+    return 9 * (28 * colours * width + (2 * width) ** 2) <= weights

@@ -17,6 +17,7 @@ from doedesign.hdr.learning import (
     read_lamp_network,
     trained_lamp_network,
     turned,
+    write_lamp_network,
 )
 from doedesign.hdr.network import (
     LampNetwork,
@@ -28,6 +29,7 @@ from doedesign.hdr.network import (
     viewed,
 )
 from doedesign.hdr.scores import compressed
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 
 SIDE = 32
@@ -168,6 +170,10 @@ def test_a_training_goes_on_where_it_was_stopped(tmp_path: Path):
     ]
     assert losses[1] < losses[0]
     assert losses[1] == losses[2]
+    # A kill after the network and before the end leaves a checkpoint, which the next call removes.
+    (tmp_path / "a" / "checkpoint.npz").touch()
+    trained_lamp_network(tmp_path / "a", lambda: pytest.fail("made again"), kernel, HOW, settings)
+    assert not (tmp_path / "a" / "checkpoint.npz").exists()
     with pytest.raises(InputError, match="settings"):
         trained_lamp_network(tmp_path / "a", examples, kernel, replace(HOW, seed=1), settings)
 
@@ -176,3 +182,26 @@ def test_a_training_goes_on_where_it_was_stopped(tmp_path: Path):
 def test_a_training_of_no_use_is_refused(wrong: dict):
     with pytest.raises(InputError):
         replace(HOW, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ({"layout": None}, "the layout must be one that this version knows"),
+        ({"layout": {"colours": 3}}, "the layout must be one that this version knows"),
+        ({"layout": {"colours": 3, "width": "4"}}, "the layout must be one that this version knows"),
+        ({"layout": {"colours": 3, "width": 0}}, "the layout must be one that this version knows"),
+        ({"layout": {"colours": 3, "width": 500}}, "the layout must be one that this version knows"),
+        ({"about": "a plate"}, "must say what it is about"),
+        ({"format": "doedesign network 1"}, "must be of format"),
+    ],
+)
+def test_a_file_that_is_no_network_for_lamps_is_refused(tmp_path: Path, said: dict, words: str):
+    """None of them is made first: one of width 3000 took twelve gigabytes."""
+    path = tmp_path / LAMP_NETWORK_NAME
+    write_lamp_network(path, LampNetwork.make(0, width=4), {"owner": "nobody"})
+    assert read_lamp_network(path)[0].width == 4
+    header, arrays = read_archive(path, "network", "")
+    write_archive(path, {**header, **said}, arrays)
+    with pytest.raises(InputError, match=words):
+        read_lamp_network(path)

@@ -335,6 +335,10 @@ def _large(header: dict[str, Any], _: Any) -> None:
     header["layout"]["width"] = 10**6
 
 
+def _larger(header: dict[str, Any], _: Any) -> None:
+    header["layout"]["width"] = 24
+
+
 def _without(_: Any, arrays: dict[str, Any]) -> None:
     arrays.pop(next(iter(arrays)))
 
@@ -350,6 +354,7 @@ def _infinite(_: Any, arrays: dict[str, Any]) -> None:
         (_other_rival, "the rival must be one of"),
         (_other_layout, "layout.*`fills` must be one of"),
         (_large, "layout.*width is 1000000"),
+        (_larger, "layout.*width is 24"),
         (_without, "every array of the layout must be there"),
         (_infinite, "weights must be finite"),
     ],
@@ -360,6 +365,13 @@ def test_a_bad_file_is_refused(path: Path, change: Any, words: str):
     write_archive(path, header, arrays)
     with pytest.raises(InputError, match=words):
         read_rival(path)
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_a_rival_has_the_weights_by_which_its_file_is_judged(name: str):
+    """A thousand times the square of its width at the least, also where it is narrow."""
+    for width in (2, 8):
+        assert count_of(RIVALS[name].make(3, 0, width=width)) >= 1000 * width**2
 
 
 def test_a_broken_or_missing_file_is_refused(path: Path, tmp_path: Path):

@@ -208,3 +208,12 @@ def test_a_layout_that_was_sealed_again_is_refused_before_anything_is_made(path:
     write_archive(path, {**header, "layout": {**header["layout"], **said}}, arrays)
     with pytest.raises(InputError, match=f"the layout must be one that this version knows.*{next(iter(said))}"):
         read_network(path)
+
+
+def test_a_file_is_about_as_large_as_the_network_that_it_promises(path: Path, monkeypatch: pytest.MonkeyPatch):
+    """To compare with, that network is made: of four megabytes with a width of 996 it took ten gigabytes."""
+    header, _ = read_archive(path, "network file", "")
+    write_archive(path, {**header, "layout": {"width": 996}}, {"a": np.zeros(1_000_000, np.float32)})
+    monkeypatch.setattr(Network, "make", lambda *_: pytest.fail("made"))
+    with pytest.raises(InputError, match=r"the layout must be one that this version knows.*width of 996"):
+        read_network(path)

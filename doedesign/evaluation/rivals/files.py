@@ -28,6 +28,8 @@ from fab.files import sha256_file
 
 FORMAT = "doedesign rival network 1"
 
+_LEAST_WEIGHTS = 1000  # that every rival has, times the square of its width
+
 _CURE = "Copy it again from where it was made, or train again."
 
 
@@ -155,9 +157,9 @@ def _empty(rival: Rival, said: Any, weights: int) -> RivalNetwork:
     """
     if not isinstance(said, dict):
         raise TypeError(f"a layout of {said!r}")
-    for key in ("colours", "width"):
-        # It is made before anything else, and must not be larger than the file.
-        if type(said.get(key)) is not int or not 1 <= said[key] ** 2 <= weights:
+    for key, least in (("colours", 1), ("width", _LEAST_WEIGHTS)):
+        # It is made before anything else, and must not be much larger than the file.
+        if type(said.get(key)) is not int or said[key] < 1 or least * said[key] ** 2 > weights:
             raise ValueError(f"{key} is {said.get(key)!r} for {weights} weights")
     return eqx.filter_eval_shape(rival.make, seed=0, **said)
 
