@@ -122,6 +122,11 @@ def evaluate(
     for name, value in (("pairs", pairs), ("draws", draws), ("seeds", len(seeds))):
         if value < 1:
             raise InputError(name, "must be at least 1", value, "Give one or more.")
+    if len(set(seeds)) < len(seeds):
+        got = ", ".join(map(str, seeds))
+        raise InputError("seeds", "must differ: a training named twice is one", got, "Name it once.")
+    if robust is not None and table == 1:
+        raise InputError("robust", "has rows in table 2 alone", robust, "Leave it out, or choose table 2.")
     require_seed(seed)
     run, programs = Path(source), [ExternalMethod.parse(text) for text in methods]
     folder = run / "evaluation" if out is None else Path(out)
@@ -131,6 +136,8 @@ def evaluate(
         if robust is not None:  # said before hours of training
             _require_same_camera(design, open_design(Path(robust), False), Path(robust))
         given = _sources(folder, images, test, licence)
+        if train:  # said before hours of it
+            _require_apart(given.images, given.test)
         lpips = read_lpips(lpips_weights) if lpips_weights else None
         how: Any = {"occlusion": occlusion, "obstruction": obstruction, "seed": seed, "border": border}
         asked = PairSet.of(design.spec, str(run / "spec.toml"), picture_files(given.test), **how)
@@ -151,12 +158,13 @@ def evaluate(
             robust=None if robust is None else Path(robust),
             lpips_weights=tuple(lpips_weights),
         )
-        needed = trainings_of(chosen)
+        looked_at = (*chosen, *_looked_through(programs))
+        needed = trainings_of(looked_at)
         require_asked(plan, needed, seeds, pictures=train or images is not None, loss=train)
         if train:
             train_missing(plan, needed, seeds, workers)
         missing = lacking(plan, needed, seeds)
-        plates = plates_of(chosen, plan, asked, seeds, missing, process, draws)
+        plates = plates_of(looked_at, plan, asked, seeds, missing, process, draws)
         ready, left = candidates_of(chosen, plan, seeds, missing, plates, asked.files)
         study = _study(design, asked, kind, lpips)
         home = folder / folder_name(table, kind, asked.model.occlusion)
@@ -252,6 +260,11 @@ def _require_apart(images: Path, test: Path) -> None:
         got = f"{twice[0]}{more} in {images}, too"
         cure = "Take out of one folder what is in both, or rename what is another picture."
         raise InputError(str(test), "pictures to judge by must not be trained on", got, cure)
+
+
+def _looked_through(programs: Sequence[ExternalMethod]) -> list[MethodRow]:
+    """Captures through the proposed plate for programs that see them, whichever rows are asked for."""
+    return [MethodRow(one.name, one.name, "external", plate="proposed") for one in programs if one.sees == "plate"]
 
 
 def _plate_seen(method: ExternalMethod, plates: Mapping[str, PlateBanks]) -> str | None:

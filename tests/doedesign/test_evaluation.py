@@ -610,6 +610,36 @@ def test_pictures_to_judge_by_are_none_of_those_trained_on(run: Path, tmp_path: 
     with pytest.raises(InputError, match=f"must not be trained on, but got {second.name} in .*images, too"):
         evaluate(run, tmp_path / "out", images=tmp_path / "images", test=tmp_path / "test", train=True)
     assert not (tmp_path / "out" / "trained").exists()
+    # Without a folder to train on, scikit-image's samples are; not all of them are for judging then.
+    with pytest.raises(InputError, match=f"must not be trained on, but got {second.name} in .*trained_on, too"):
+        evaluate(run, tmp_path / "out", test=tmp_path / "test", train=True)
+    assert not (tmp_path / "out" / "trained").exists()
+
+
+def test_a_seed_named_twice_and_a_robust_design_without_rows_are_refused(run: Path, tmp_path: Path):
+    """Twice the same scores would stand in the table as two trainings."""
+    with pytest.raises(InputError, match=r"seeds: must differ.*but got 0, 1, 0"):
+        evaluate(run, tmp_path / "out", seeds=(0, 1, 0))
+    with pytest.raises(InputError, match="robust: has rows in table 2 alone"):
+        evaluate(run, tmp_path / "out", table=1, robust=run)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_program_sees_the_plate_whichever_rows_are_asked_for(
+    run: Path, copies: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As if a training of no steps had left the plate as it was."""
+    monkeypatch.setattr(evaluate_module, "lacking", lambda *_: {})
+    monkeypatch.setattr(TrainingPlan, "design_after", TrainingPlan.design)
+    how: Any = {"pairs": 1, "rows": ("conventional_capture",), "workers": 0}
+    table = evaluate(run, tmp_path / "out", methods=[f"copy:plate={copies}"], **how)
+    rows = {one.row.name: one for one in table.rows}
+    assert not rows["copy"].why
+    assert rows["copy"].scores["full"]["psnr"] != rows["conventional_capture"].scores["full"]["psnr"]
+    # What is not trained yet is still not there.
+    monkeypatch.setattr(evaluate_module, "lacking", lambda *_: {"proposed": "not trained for seed 0"})
+    table = evaluate(run, tmp_path / "other", methods=[f"copy:plate={copies}"], **how)
+    assert {one.row.name: one.why for one in table.rows}["copy"] == "there is no proposed plate yet"
 
 
 def test_a_program_is_found_out(run: Path, tmp_path: Path):
