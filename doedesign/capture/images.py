@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 
 from fab.errors import InputError
 from fab.files import canonical_json, os_errors_explained, sha256_bytes, sha256_file
-from fab.pictures import read_display
+from fab.pictures import MOST_PIXELS, read_display
 
 PICTURE_FILES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 SAMPLES = ("motorcycle_left.png", "rocket.jpg", "coffee.png", "astronaut.png", "chelsea.png", "camera.png")
@@ -160,13 +160,16 @@ def crop(
 ) -> UInt8[np.ndarray, "v u 3"]:
     """Cut a window of `shape` (y, x) out of a picture, which is enlarged first if the window does not fit.
 
-    Its `place` between the lowest and highest row, and the first and last column, is 0 to 1 each.
+    Its `place` between the lowest and highest row, and the first and last column, is 0 to 1 each. Of a strip that would
+    be enlarged to gigabytes the window alone is.
     """
     scale = max(n / m for n, m in zip(shape, picture.shape[:2], strict=True))
     if scale > 1:
         from PIL import Image
 
         size = tuple(max(n, round(m * scale)) for n, m in zip(shape, picture.shape[:2], strict=True))
+        if size[0] * size[1] > MOST_PIXELS:  # a narrow strip, of which little is seen
+            return zoomed(picture, shape, 1.0, place, mirror)
         large = Image.fromarray(picture).resize((size[1], size[0]), Image.Resampling.BICUBIC)
         picture = np.asarray(large, np.uint8)
     y, x = (round(at * (m - n)) for at, n, m in zip(place, shape, picture.shape[:2], strict=True))

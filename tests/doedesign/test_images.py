@@ -69,6 +69,17 @@ def test_windows_of_a_picture():
     assert np.all(large == 50)
 
 
+def test_of_a_strip_the_window_alone_is_enlarged(monkeypatch: pytest.MonkeyPatch):
+    """Two pixels by three thousand would take gigabytes as high as a frame; what is seen is the same."""
+    strip = noise((2, 3000, 3))
+    assert crop(strip, (512, 512), (0.5, 0.5)).shape == (512, 512, 3)
+    short = strip[:, :600]
+    whole = crop(short, (64, 64), (0.5, 0.25), True)
+    monkeypatch.setattr("doedesign.capture.images.MOST_PIXELS", 64 * 600)
+    # The place of the window is rounded to pixels of the large picture, or not: a 32nd of a pixel of the strip.
+    assert np.abs(crop(short, (64, 64), (0.5, 0.25), True).astype(int) - whole).mean() < 255 / 32
+
+
 def test_a_share_of_a_picture():
     y, x = np.mgrid[:60, :90]
     picture = np.stack([4 * y, 2 * x, 0 * x], axis=-1).astype(np.uint8)
