@@ -94,6 +94,14 @@ class LampCamera:
         """Shares of the lines in white light, `[c, line]`."""
         return np.array([colour.weights for colour in self.camera.colours])
 
+    @property
+    def held(self) -> Float[np.ndarray, "c 1 1"]:
+        """Light, white 1, that a pixel of every colour holds beside what heat frees: the full well, or full scale."""
+        sensor, colours = self.sensor, len(self.camera.colours)
+        if not sensor.counts_photons:
+            return np.ones((colours, 1, 1), np.float32)
+        return (sensor.full_well_e - sensor.dark_e) / sensor.white_e(colours)
+
     def psf(self, optic: Any, sampling: float | None = None) -> LinePsfs:
         """PSFs of a star for every line.
 
@@ -148,17 +156,16 @@ class LampCamera:
         """
         light = self.light_of(scene, psfs)
         # White fills less of the well in colours that the sensor sees badly, so wells overflow by electrons.
-        white_e = self.sensor.white_e(len(light))
-        spread = bloomed(light * white_e, self.sensor.full_well_e, self.spilled) / white_e
+        sensor, white_e = self.sensor, self.sensor.white_e(len(light))
+        most_e = sensor.full_well_e - sensor.dark_e if sensor.counts_photons else white_e
+        spread = bloomed(light * white_e, most_e, self.spilled) / white_e
         raw = expose(spread if self.spilled else jnp.asarray(light), self.sensor, jax.random.key(seed))
         found = np.asarray(developed(raw, self.sensor))
-        ceilings = self.sensor.full_well_e / white_e
-        return LampCapture(found, found >= _FULL * ceilings)
+        return LampCapture(found, found >= _FULL * self.held)
 
     def saturated(self, scene: LampScene) -> Bool[np.ndarray, "c y x"]:
         """Where the scene itself is brighter than a pixel holds, whatever stands in the aperture."""
-        light = scene.light()
-        return light > self.sensor.full_well_e / self.sensor.white_e(len(light))
+        return scene.light() > self.held
 
 
 _NYQUIST = 2.0  # samples of the light per wavelength x distance / aperture

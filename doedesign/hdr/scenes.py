@@ -188,6 +188,12 @@ class LampScenes:
     gain: tuple[float, float] = (0.3, 1.0)
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Raise an InputError for a frame that has no place for a lamp."""
+        if self.frame_px < 2 * _SPACE_PX:
+            rule, cure = f"lamps keep {_SPACE_PX} pixels from the edge of the frame on every side", "Make it larger."
+            raise InputError("frame_px", rule, self.frame_px, cure)
+
     def scene(self, number: int, weights: Float[np.ndarray, "c l"]) -> LampScene:
         """Scene of a number, for a camera with these shares `[c, line]` of lines in white light; 3 colours.
 

@@ -197,6 +197,35 @@ def test_a_bare_scene_comes_out_as_it_is():
     assert capture.light.max() == pytest.approx(1.25, rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("sensor", "most"),
+    [
+        # White fills 0.8 of the well, and heat a tenth of it: 0.9 / 0.8.
+        (replace(SILENT, dark_e=2000.0), 1.125),
+        (Sensor(noise="release"), 1.0),  # white is full scale
+        (Sensor(noise="tseng", bits=None), 1.0),
+    ],
+)
+def test_a_pixel_is_full_where_its_raw_numbers_end(sensor: Sensor, most: float):
+    camera = replace(lamp_camera(), sensor=sensor)
+    energy = np.zeros((3, 3, 31, 31), np.float32)
+    energy[:, :, 15, 15] = 1
+    scene = scenes().scene(0, camera.weights)
+    assert np.array_equal(camera.saturated(scene), scene.light() > most)
+    for spilled in (0.0, 0.5):
+        found = replace(camera, spilled=spilled).capture(scene, LinePsfs(energy, camera.weights), 0)
+        assert found.light.max() == pytest.approx(most, rel=1e-3)  # a step of twelve bits
+        # Wherever lamps are; a margin for noise and for what counts as full a little before.
+        assert found.full[scene.light() > 1.03 * most].all()
+    assert not camera.capture(scene, LinePsfs(energy, camera.weights), 0).full[scene.light() < 0.95 * most].any()
+
+
+def test_a_frame_without_a_place_for_lamps_is_refused():
+    with pytest.raises(InputError, match="frame_px"):
+        replace(scenes(), frame_px=19)
+    assert replace(scenes(), frame_px=20).scene(0, WEIGHTS).light().shape == (3, 20, 20)
+
+
 def test_psfs_that_reach_beyond_a_scene_are_refused():
     camera = lamp_camera()
     far = LinePsfs(np.zeros((3, 3, 91, 91), np.float32), camera.weights)
