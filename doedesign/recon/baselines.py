@@ -49,10 +49,12 @@ def noise_variance(capture: Float[np.ndarray, "c y x"], sensor: Sensor) -> Float
 def noise_to_signal(capture: Float[np.ndarray, "c y x"], variance: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
     """Ratio of the noise's variance (`noise_variance`) to that of the picture under it, for `wiener`.
 
-    At most 1: a capture that is all noise is halved, not more.
+    At most 1: a capture that is all noise is halved, not more. At least what single precision rounds, squared: a sensor
+    without noise would otherwise have what no light says divided by nothing.
     """
     seen = capture.var(axis=(1, 2), dtype=np.float64)
-    return variance / np.maximum(seen - variance, np.maximum(variance, np.finfo(np.float32).tiny))
+    ratio = variance / np.maximum(seen - variance, np.maximum(variance, np.finfo(np.float32).tiny))
+    return np.maximum(ratio, float(np.finfo(np.float32).eps) ** 2)
 
 
 @jax.jit

@@ -65,6 +65,17 @@ def test_the_ratio_is_that_of_the_variances():
     np.testing.assert_allclose(noise_to_signal(np.full((1, 9, 9), 0.5, np.float32), np.array([0.01])), 1.0)
 
 
+def test_of_a_sensor_without_noise_the_ratio_is_that_of_rounding(light: np.ndarray):
+    """A PSF that passes nothing at one frequency: nothing is won there, and nothing divided by nothing."""
+    quiet = Sensor(noise="none", bits=None)
+    capture = np.asarray(light, np.float32)
+    ratio = noise_to_signal(capture, noise_variance(capture, quiet))
+    assert ratio == pytest.approx(2.0**-46, abs=0)  # the square of the last of 24 bits
+    psf = np.zeros((len(capture), 3, 3), np.float32)
+    psf[:, 1] = 0.25, 0.5, 0.25  # 0 at half a wave per pixel
+    assert np.isfinite(wiener(capture, psf, ratio)).all()
+
+
 def test_both_undo_a_known_blur(light: np.ndarray, capture: np.ndarray):
     """The transfer function falls to 0.14 and no lower, so nothing is lost.
 
