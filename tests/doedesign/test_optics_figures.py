@@ -1,5 +1,6 @@
 """Figures 4 and 8: modulation transfer, zeroth order and concentric energy against closed forms."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +112,13 @@ def test_what_cannot_be_compared_is_said(small: Design):
     assert set(comparison_plates(small.bare(), fresnel_m=5e-3)) == {THIN_LENS, FRESNEL, RANDOM, RING}
     with pytest.raises(InputError, match="a depth is needed"):
         compare_optics(replace(small, near_m=()), {})
+
+
+def test_plates_are_compared_at_the_nearest_and_the_farthest_depth(small: Design):
+    """In whichever order a spec lists them."""
+    turned = replace(small, near_m=(9e-3, 6e-3, 8e-3), far_m=(math.inf, 0.5))
+    found = compare_optics(turned, {})
+    assert (found.near_m, found.far_m) == (6e-3, math.inf)
 
 
 def test_light_of_a_flat_plate_lies_in_the_disc_and_is_even():

@@ -185,10 +185,10 @@ def compare_optics(
     if camera.distance_m is not None:
         raise InputError("design", "the comparison is one behind a lens", camera.lens_text, "Choose another design.")
     ends = []
-    for words, given, own in (("near", near, design.near_m[:1]), ("far", far, design.far_m[-1:])):
+    for words, given, own, end in (("near", near, design.near_m, min), ("far", far, design.far_m, max)):
         if given is None and not own:
             raise InputError(words, "a depth is needed", "none", f"Give `{words}`.")
-        ends.append(depths_from(given)[0] if given is not None else own[0])
+        ends.append(depths_from(given)[0] if given is not None else end(own))
     depths_m = near_m, far_m = ends[0], ends[1]
     others = comparison_plates(design) if plates is None else plates
     optics: dict[str, CellOptic] = {
