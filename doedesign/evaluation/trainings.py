@@ -3,9 +3,9 @@
     OUT/trained/OCCLUSION/OBSTRUCTION/NAME_SEED/    a training as `doedesign train` writes it, or that of a rival
 
 A finished training of the design's own run (`RUN/trained`, or a released model) with the same seed, occlusion model and
-obstruction stands for "proposed". All are trained on the same pictures, with the steps, sizes and seeds of the
-design's spec; others in OUT are refused. On a processor several are trained side by side, each by a process with one
-thread: a training keeps little more than one core busy, however many there are.
+kind of obstruction, or masks, stands for "proposed". All are trained on the same pictures, with the steps, sizes and
+seeds of the design's spec; others in OUT are refused. On a processor several are trained side by side, each by a
+process with one thread: a training keeps little more than one core busy, however many there are.
 """
 
 import json
@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 
 import jax
 
+from doedesign.capture.from_spec import obstruction_from_spec, plain_parameters
 from doedesign.design.design import Design
 from doedesign.evaluation.rivals.files import rival_named
 from doedesign.evaluation.rivals.training import rival_options, train_rival
@@ -34,6 +35,7 @@ from doedesign.training.history import HISTORY_NAME
 from doedesign.training.train import prepared, train
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json
+from sim.obstruction import OBSTRUCTIONS, MaskFolder
 
 _TRAINING_BYTES = 4 << 30  # an estimate: a training at its peak, crops of 256 pixels
 _log = logging.getLogger("doedesign")
@@ -78,11 +80,20 @@ class TrainingPlan:
     def _is_same(self, folder: Path, seed: int) -> bool:
         if not _is_finished(folder):
             return False
-        about = read_network(folder / NETWORK_NAME)[1]
-        asked = {"occlusion": self.occlusion, "obstruction": self.obstruction, "camera": "doe"}
+        about, kind = read_network(folder / NETWORK_NAME)[1], self.obstruction
+        kind = kind if kind in OBSTRUCTIONS else MaskFolder.name
+        asked = {"occlusion": self.occlusion, "obstruction": kind, "camera": "doe"}
         if any(about.get(key) != value for key, value in asked.items()):
             return False
+        if kind != self.obstruction and not self._has_masks(about.get("obstruction_parameters")):
+            return False
         return open_run(folder).spec.train.seed == seed
+
+    def _has_masks(self, told: Any) -> bool:
+        """Whether parameters of an obstruction, as a training tells them, are of the masks in the plan's folder."""
+        masks = obstruction_from_spec(open_run(self.run).spec, str(self.run / "spec.toml"), self.obstruction)
+        wanted = plain_parameters(masks)["files_sha256"]
+        return isinstance(told, dict) and told.get("files_sha256") == wanted
 
     def done(self, training: Training, seed: int) -> bool:
         """Whether a training is finished."""

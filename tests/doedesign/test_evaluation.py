@@ -19,6 +19,7 @@ from skimage import data, restoration
 
 import doedesign.evaluation.evaluate as evaluate_module
 from doedesign.calibration.measurement import load_measurement
+from doedesign.capture.from_spec import plain_parameters
 from doedesign.capture.images import sample_files
 from doedesign.evaluation.candidates import candidates_of
 from doedesign.evaluation.evaluate import evaluate
@@ -42,7 +43,9 @@ from doedesign.spec.values.table import SpecTable
 from doedesign.training.train import prepared
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json
+from fab.pictures import write_pixels
 from sim.light import linear_from_srgb, srgb_from_linear
+from sim.obstruction import MaskFolder
 from sim.optic import HeightOptic
 from sim.psf_bank import PsfBank, psf
 from sim.sensor import Sensor
@@ -772,6 +775,26 @@ def test_a_training_of_the_run_itself_stands_for_the_proposed_one_whatever_it_wa
     (tmp_path / "run" / "trained" / MANIFEST_NAME).write_bytes(canonical_json(changed))
     require_asked(plan, [TRAININGS["proposed"]], (0,), pictures=False, loss=False)
     assert "stands for proposed; what is asked for differs from it in its spec" in caplog.text
+
+
+def test_a_training_of_the_run_behind_masks_of_a_folder_stands_for_the_proposed_one(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The kind that it tells is "folder", whatever that is called: masks are known by what they show."""
+    own, masks = tmp_path / "run", tmp_path / "masks"
+    shutil.copytree(run, own)
+    (own / NETWORK_NAME).touch()
+    masks.mkdir()
+    write_pixels(masks / "a.png", np.eye(8, dtype=np.uint8) * 255)
+    (masks / "a.json").write_text('{"pitch_um": 50}')
+    about = {"occlusion": "paper", "obstruction": "folder", "camera": "doe"}
+    about |= {"obstruction_parameters": plain_parameters(MaskFolder(masks))}
+    monkeypatch.setattr("doedesign.evaluation.trainings.read_network", lambda _: (None, about))
+    plan = TrainingPlan(own, tmp_path / "out", "paper", str(masks))
+    assert plan.folder(TRAININGS["proposed"], 0) == own
+    assert replace(plan, obstruction="dirt").folder(TRAININGS["proposed"], 0) != own
+    write_pixels(masks / "a.png", np.ones((8, 8), np.uint8) * 255)
+    assert plan.folder(TRAININGS["proposed"], 0) != own
 
 
 @pytest.mark.study
