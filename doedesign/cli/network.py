@@ -34,7 +34,7 @@ FarDepth = Annotated[
     str | None,
     Parameter(
         help='Distance of the scene, such as "5 m" or inf; by default that which the model was trained for, or the '
-        "farthest there is a PSF of where the model states none."
+        "farthest there is a PSF of where the model states none or --psf has none of it."
     ),
 ]
 

@@ -168,7 +168,8 @@ class Model:
                 G, B, or one) is taken as measured, and scaled to the energy of the model's own PSF.
             pixel_m: pixel pitch of measured PSFs, metres; only with files.
             near_m: distance of the obstruction; the middle, in 1/z, of what the network was trained on if None.
-            far_m: distance of the scene; what the network was trained for, or the farthest of other PSFs if None.
+            far_m: distance of the scene; if None what the network was trained for, or the farthest of the PSFs where it
+                does not say that or they have none of it.
 
         Raises:
             InputError: files that cannot be used, or a depth beyond a bank's.
@@ -178,12 +179,12 @@ class Model:
             raise InputError("pixel_m", rule, "the model's own PSFs", cure)
         near_m = middle_depth_m(self.near_m) if near_m is None else near_m
         if not files:
-            own_m = next((z for z in (far_m, self.far_m) if z is not None), max(self.bank.depths_m))
+            own_m = self._usual_far_m(self.bank) if far_m is None else far_m
             return _pair(self.bank, self.bank, own_m, near_m)
         if len(files) > 2:
             rule = "must be one bank, or one file of the scene and one of the obstruction"
             raise InputError("psf", rule, f"{len(files)} files", "Give one or two.")
-        usual = max(self.bank.depths_m) if far_m is None else far_m
+        usual = self._usual_far_m(self.bank) if far_m is None else far_m
         banks = [
             self._fitted(read_bank(path, pixel_m, depth), path, depth)
             for path, depth in zip(files, (usual, near_m), strict=False)
@@ -191,9 +192,14 @@ class Model:
         if len(banks) == 1 and len(banks[0].depths_m) == 1:
             rule = "PSFs of the scene and of the obstruction are needed"
             raise InputError(str(files[0]), rule, "one depth", "Give two files, first that of the scene.")
-        far_m = max(banks[0].depths_m) if far_m is None else far_m
+        far_m = self._usual_far_m(banks[0]) if far_m is None else far_m
         digests = {path.name: sha256_file(path) for path in files}
         return _pair(banks[0], banks[-1], far_m, near_m)._replace(digests=digests)
+
+    def _usual_far_m(self, bank: PsfBank) -> float:
+        """Distance of the scene that the network is told of by a bank where nobody states one."""
+        nearest, farthest = min(bank.depths_m), max(bank.depths_m)
+        return farthest if self.far_m is None or not nearest <= self.far_m <= farthest else self.far_m
 
     def reconstruct(
         self,

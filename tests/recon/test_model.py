@@ -117,3 +117,21 @@ def test_a_measured_psf_is_known_by_its_file_and_not_by_its_names(tmp_path: Path
     write_bank(tmp_path / "near.exr", alone)
     found = model.psfs([tmp_path / "counts.exr", tmp_path / "near.exr"], pixel_m=PIXEL, near_m=0.05)
     np.testing.assert_array_equal(found.near[:, 1:-1, 1:-1], alone.energy[:, 0])
+
+
+def test_other_psfs_are_taken_at_the_distance_that_the_network_was_trained_for(model: Model, tmp_path: Path):
+    """As the model's own are, unless they have none of it."""
+    trained = replace(model, far_m=6.0)
+    other = bank(seed=1)
+    write_bank(tmp_path / "made.exr", other)
+    found = trained.psfs([tmp_path / "made.exr"])
+    assert (found.far_m, trained.psfs().far_m) == (6.0, 6.0)
+    np.testing.assert_array_equal(found.far, other.at(6.0))
+    assert model.psfs([tmp_path / "made.exr"]).far_m == np.inf  # it says none
+    write_bank(tmp_path / "near.exr", bank(depths=(0.05, 0.12, 5.0)))
+    assert trained.psfs([tmp_path / "near.exr"]).far_m == 5.0
+    # A measured one has the energy of the model's own there.
+    write_picture(tmp_path / "far.exr", dict(zip("RGB", np.ones((3, 7, 7)), strict=True)))
+    found = trained.psfs([tmp_path / "far.exr"] * 2, pixel_m=PIXEL)
+    assert found.far_m == 6.0
+    np.testing.assert_allclose(found.far.sum(axis=(1, 2)), trained.psfs().far.sum(axis=(1, 2)), rtol=1e-5)
