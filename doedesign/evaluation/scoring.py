@@ -141,6 +141,8 @@ class ScoreLines:
         key, found = line["key"], line["scores"]
         if not isinstance(key, str):
             raise TypeError("a key must be text")
+        if not isinstance(found, dict) or not all(isinstance(values, dict) for values in found.values()):
+            raise TypeError("scores must be listed by region and name")
         return key, {
             str(region): {str(name): None if value is None else float(value) for name, value in values.items()}
             for region, values in found.items()

@@ -115,16 +115,23 @@ def _described(path: Path) -> dict[str, Any] | None:
     if not (path.parent / MANIFEST_NAME).is_file():
         return None
     manifest = read_json(path.parent / MANIFEST_NAME)
-    if not str(manifest.get("format", "")).startswith("doedesign simulation") or "images" not in manifest:
+    images = manifest.get("images")
+    if not str(manifest.get("format", "")).startswith("doedesign simulation") or not isinstance(images, dict):
         return None
-    named = next(((name, one) for name, one in manifest["images"].items() if one.get("file") == path.name), None)
-    if named is None:
+    described = ((name, one) for name, one in images.items() if isinstance(one, dict))
+    name, stored = next((each for each in described if each[1].get("file") == path.name), ("", None))
+    if stored is None:
         return None
-    name, stored = named
+    # OpenEXR holds the numbers as they are.
+    scale = 1.0 if path.suffix.lower() == ".exr" else stored.get("full_scale")
+    digests = manifest.get("sha256")
+    if not (isinstance(scale, float | int) and scale > 0 and isinstance(stored.get("what"), str)):
+        rule, got = f"must say what {path.name} shows, and what its counts mean", f"{stored}"
+        raise InputError(str(path.parent / MANIFEST_NAME), rule, got, "Simulate it again.")
     if name not in _LIGHT:  # a share of light may have its channels, too
         rule = "a capture must be a picture of light"
         raise InputError(str(path), rule, stored["what"], "Give `capture` or `conventional` of that folder.")
-    if path.is_file() and manifest.get("sha256", {}).get(path.name) != sha256_file(path):
+    if path.is_file() and (digests if isinstance(digests, dict) else {}).get(path.name) != sha256_file(path):
         raise InputError(str(path), "must be what its manifest describes", "a changed file", "Simulate it again.")
     return stored
 

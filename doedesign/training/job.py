@@ -189,9 +189,13 @@ def _is_done(folder: Path, job: TrainingJob, digest: str) -> bool:
         raise InputError(str(folder), rule, job.differs, cure)
     if (folder / "validation").is_dir():
         clear_killed(folder / "validation", lambda name: name.endswith(".png"))
-    if found["state"] != "done":
+    if found.get("state") != "done":
         return False
-    for name, expected in found["results_sha256"].items():
+    results = found.get("results_sha256")
+    if not isinstance(results, dict):
+        cure = f"Restore it, or remove {folder} and start again."
+        raise InputError(str(path), f"must list the results of a finished {job.name}", repr(results), cure)
+    for name, expected in results.items():
         if sha256_file(folder / name) != expected:
             rule = f"must be the file this {job.name} wrote"
             cure = f"Restore it, or remove {folder} and start again."

@@ -713,6 +713,16 @@ def test_some_rows_alone_are_what_they_are_among_all(run: Path, tmp_path: Path):
     assert {one.row.name: one.scores for one in some.rows}.items() < {o.row.name: o.scores for o in every.rows}.items()
 
 
+@pytest.mark.parametrize("scores", ["[1]", "3", '{"full": 2}'])
+def test_a_line_that_holds_no_scores_is_refused(run: Path, tmp_path: Path, scores: str):
+    how: Any = {"pairs": 1, "rows": ("conventional_capture",), "workers": 0}
+    evaluate(run, tmp_path / "out", **how)
+    journal = tmp_path / "out" / "table2-dirt-paper" / "scores.jsonl"
+    journal.write_text(f'{{"key": "conventional_capture@0#0/0", "scores": {scores}}}\n')
+    with pytest.raises(InputError, match="line 1: must be one finished score"):
+        evaluate(run, tmp_path / "out", **how)
+
+
 def test_another_question_needs_another_folder(run: Path, tmp_path: Path):
     evaluate(run, tmp_path / "out", pairs=1, workers=0)
     with pytest.raises(InputError, match=r"one with another .*seed"):

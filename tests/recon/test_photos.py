@@ -14,7 +14,7 @@ from PIL import Image
 from doedesign.capture.image_files import write_image
 from doedesign.recon.photos import read_capture, write_reconstruction
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_file
+from fab.files import canonical_json, read_json, sha256_file
 from sim.light import linear_from_srgb, srgb_from_linear
 from sim.store import read_picture, write_picture
 from tests.sim.test_frames import write_dng
@@ -143,6 +143,28 @@ def test_of_a_simulation_only_light_is_taken(tmp_path: Path, png_files: bool):
     paths["capture"].write_bytes(paths["mask"].read_bytes())
     with pytest.raises(InputError, match="must be what its manifest describes"):
         read_capture(paths["capture"])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"images": [1]}, ""),  # nobody's business
+        ({"images": {"capture": 1}}, ""),
+        ({"sha256": ["a"]}, "must be what its manifest describes"),
+        ({"images": {"capture": {"file": "capture.png"}}}, "must say what capture.png shows"),
+        ({"images": {"capture": {"file": "capture.png", "what": "light"}}}, "must say what capture.png shows"),
+        ({"images": {"capture": {"file": "capture.png", "what": "light", "full_scale": "2"}}}, "what its counts mean"),
+    ],
+)
+def test_a_manifest_that_describes_nothing_is_refused(tmp_path: Path, change: dict, words: str):
+    path = simulated(tmp_path)["capture"]
+    manifest = tmp_path / "manifest.json"
+    manifest.write_bytes(canonical_json({**read_json(manifest), **change}))
+    if words:
+        with pytest.raises(InputError, match=words):
+            read_capture(path)
+    else:
+        assert not read_capture(path).linear
 
 
 def test_raw_is_demosaiced_and_left_linear(tmp_path: Path):

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -39,7 +40,7 @@ from doedesign.training.train import train
 from doedesign.training.validation import split_pictures
 from fab.errors import InputError
 from fab.figure import save
-from fab.files import read_json
+from fab.files import canonical_json, read_json
 from fab.level_map import read_level_map
 from fab.pictures import read_display
 from sim.psf_bank import psf
@@ -226,12 +227,20 @@ def test_the_trained_plate_can_be_ordered(run: Path, whole: Path):
     assert 0 < np.mean(drawn.level != before.level) < 0.2
 
 
-def test_what_is_finished_stays(run: Path, images: Path, whole: Path):
+def test_what_is_finished_stays(run: Path, images: Path, whole: Path, tmp_path: Path):
     before = content(whole)
     code, said = trained(run, whole, images)
     assert code == 0
     assert "already holds this finished training" in said
     assert content(whole) == before
+    # A manifest that does not list what is finished is no proof of it.
+    copy = tmp_path / "copy"
+    shutil.copytree(whole, copy)
+    manifest = read_json(copy / "manifest.json")
+    (copy / "manifest.json").write_bytes(canonical_json({**manifest, "results_sha256": None}))
+    code, said = trained(run, copy, images)
+    assert code == 2
+    assert "must list the results of a finished training" in said
 
 
 @pytest.mark.slow
