@@ -146,6 +146,9 @@ def evaluate(
         kind = obstruction or (own.kind if own else "")  # without either no pairs are made
         _require_names(programs, rows_of(table, kind, robust=robust is not None))
         chosen = rows_of(table, kind, robust=robust is not None, names=rows)
+        if process is not None and not any(row.fabricated for row in chosen):
+            rule, cure = "is that of plates as fabricated", "Leave it out, or ask for such a row of table 2."
+            raise InputError("process", rule, "no row with such a plate", cure)
         plan = TrainingPlan(
             run,
             folder,

@@ -619,13 +619,15 @@ def test_pictures_to_judge_by_are_none_of_those_trained_on(run: Path, tmp_path: 
     assert not (tmp_path / "out" / "trained").exists()
 
 
-def test_a_seed_named_twice_and_a_robust_design_without_rows_are_refused(run: Path, tmp_path: Path):
+def test_a_seed_named_twice_and_what_no_row_looks_at_are_refused(run: Path, tmp_path: Path):
     """Twice the same scores would stand in the table as two trainings."""
     with pytest.raises(InputError, match=r"seeds: must differ.*but got 0, 1, 0"):
         evaluate(run, tmp_path / "out", seeds=(0, 1, 0))
     with pytest.raises(InputError, match="robust: has rows in table 2 alone"):
         evaluate(run, tmp_path / "out", table=1, robust=run)
     assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="process: is that of plates as fabricated.*but got no row with such a plate"):
+        evaluate(run, tmp_path / "out", table=1, process="contact_aligner")
 
 
 def test_a_program_sees_the_plate_whichever_rows_are_asked_for(
