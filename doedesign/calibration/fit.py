@@ -168,7 +168,9 @@ class _LeastSquares:
         free = np.full(motions, np.inf)
         free[: self.objective.shared - self.objective.errors] = REACH
         self.origin = np.clip(start_x, [*ends[0], *-free], [*ends[1], *free]) - _TRUSTED
-        self.bounds = ([*ends[0], *-free] - self.origin, [*ends[1], *free] - self.origin)
+        # Where it begins at an end of the range, rounding may not put it beyond.
+        low, high = [*ends[0], *-free] - self.origin, [*ends[1], *free] - self.origin
+        self.bounds = (np.minimum(low, _TRUSTED), np.maximum(high, _TRUSTED))
 
     def solve(self) -> tuple[Evaluation, Jacobian]:
         """The best evaluation, and the derivatives there or next to it."""

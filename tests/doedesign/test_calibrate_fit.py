@@ -146,6 +146,14 @@ def test_steps_go_on_until_the_images_are_explained():
     assert last < 1.2
 
 
+def test_a_search_may_begin_at_the_low_end_of_a_range():
+    """Of some ends, offset to 5 standard deviations and back, rounding makes a little more than 5."""
+    low = next(end for end in -np.linspace(3.1, 4.9, 1000) if end - (end - 5.0) > 5.0) * SIGMA[0]
+    truth, start = np.array([low - 0.05, 0.1]), np.array([low, 0.0])
+    found = search(analytic_objective(truth, low=np.array([low, -2.5]), start=start))
+    assert posterior_of(found).values[0] == pytest.approx(low)
+
+
 def test_what_is_explained_needs_no_search_through_the_range():
     words: list[str] = []
     search(analytic_objective(TRUTH), evaluations=60, on_model=words.append)
