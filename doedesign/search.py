@@ -63,7 +63,6 @@ def least(
 
     for name, evaluations in stages:
         search = nlopt.opt(getattr(nlopt, ALGORITHMS[name]), len(first))
-        search.set_min_objective(followed)
         search.set_lower_bounds(low)
         search.set_upper_bounds(high)
         search.set_initial_step(step)
@@ -74,10 +73,43 @@ def least(
             search.set_local_optimizer(_local(nlopt, len(first), step))
         nlopt.srand(seed + 1)  # 0 would take the time
         try:
-            search.optimize(best)
+            run_search(search, followed, best)
         except nlopt.RoundoffLimited:
             continue  # as near as numbers allow
     return [float(value) for value in best]
+
+
+def run_search(search: Any, loss: Callable[[np.ndarray, np.ndarray], float], start: np.ndarray) -> None:
+    """Run a search of NLopt; an error in the loss, or Ctrl-C, ends it and is raised as it is.
+
+    Left to NLopt, it would not end a controlled random search that draws its first points, which then calls the loss
+    with the error still in flight.
+
+    Args:
+        search: the search, an `nlopt.opt`.
+        loss: the loss of values, which keeps what is found; the gradient that it is given is empty.
+        start: values to begin with.
+    """
+    raised: list[BaseException] = []
+
+    def guarded(values: np.ndarray, gradient: np.ndarray) -> float:
+        if raised:
+            return 0.0
+        try:
+            return loss(values, gradient)
+        except BaseException as error:
+            raised.append(error)
+            search.force_stop()
+            return 0.0
+
+    search.set_min_objective(guarded)
+    try:
+        search.optimize(start)
+    except Exception:  # of NLopt, which may end in several ways
+        if not raised:
+            raise
+    if raised:
+        raise raised[0]
 
 
 def _local(nlopt: Any, count: int, step: float) -> Any:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("doedesign")
 
 _EXPLAINED = 1.5  # chi2 per pixel up to which images count as explained
+_SEEDS = 2**63  # NLopt takes numbers of 64 bits
 _SURPRISING = 3.0  # standard deviations of the prior, of the camera's geometry
 
 
@@ -156,6 +157,8 @@ def calibrate(
     for name, value in (("evaluations", evaluations), ("polish", polish), ("seed", seed)):
         if value < 0:
             raise InputError(name, "must be 0 or more", value, "Leave it out, or give another.")
+    if seed >= _SEEDS:
+        raise InputError("seed", "must be below 2^63", seed, "Leave it out, or give another.")
     design = open_design(design, masks)
     prior = design.process(process)
     unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # refuses mistakes before files are read

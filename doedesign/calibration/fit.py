@@ -24,6 +24,8 @@ from scipy.optimize import LinearConstraint, least_squares, minimize
 from doedesign.calibration.geometry import REACH
 from doedesign.calibration.objective import WIDEST_STEP, Evaluation, FitObjective, Jacobian, Linearization, OnModel
 from doedesign.calibration.target import measured_weights, weights_at
+from doedesign.search import run_search
+from fab.errors import InputError
 
 _ROUNDS = 15
 _MOST_TRIALS = 60  # of one round
@@ -96,29 +98,33 @@ def _global(start: Evaluation, evaluations: int, seed: int, on_model: OnModel) -
     """Best model of a controlled random search over the errors; images stay where they were found."""
     objective = start.objective
     unknowns, errors = objective.unknowns, objective.errors
-    best: list[Evaluation] = []
+    best: Evaluation | None = None
+    worst = start.cost
 
     def cost(point: np.ndarray, _: np.ndarray) -> float:
+        nonlocal best, worst
         # The range is a box in values; scores of related errors are not.
         value = np.clip(point, unknowns.low, unknowns.high)
-        at = objective.evaluate(start.weights, np.concatenate([unknowns.scores(value), start.scores[errors:]]))
-        if not best or at.cost < best[0].cost:
-            best[:] = [at]
-        on_model(f"global, {best[0].cost / objective.pixels:.4g} per pixel")
+        try:
+            at = objective.evaluate(start.weights, np.concatenate([unknowns.scores(value), start.scores[errors:]]))
+        except InputError:  # errors that are beyond the model together
+            return 2 * worst
+        best, worst = min(best or at, at, key=lambda one: one.cost), max(worst, at.cost)
+        on_model(f"global, {best.cost / objective.pixels:.4g} per pixel")
         return at.cost
 
     optimiser = nlopt.opt(nlopt.GN_CRS2_LM, errors)
     nlopt.srand(seed + 1)  # 0 would take the time
-    # Twice the standard deviation: the local search finds what lies beyond.
-    low = np.maximum(unknowns.low, unknowns.mean - 2 * unknowns.sigma)
-    high = np.minimum(unknowns.high, unknowns.mean + 2 * unknowns.sigma)
+    # Twice the standard deviation: the local search finds what lies beyond. The mean may lie outside the range.
+    middle = np.clip(unknowns.mean, unknowns.low, unknowns.high)
+    low = np.maximum(unknowns.low, middle - 2 * unknowns.sigma)
+    high = np.minimum(unknowns.high, middle + 2 * unknowns.sigma)
     optimiser.set_lower_bounds(low)
     optimiser.set_upper_bounds(high)
     optimiser.set_population(min(5 * (errors + 1), max(evaluations // 2, errors + 1)))
-    optimiser.set_min_objective(cost)
     optimiser.set_maxeval(evaluations)
-    optimiser.optimize(np.clip(objective.values(start.scores), low, high))
-    return best[0]
+    run_search(optimiser, cost, np.clip(objective.values(start.scores), low, high))
+    return best or start
 
 
 def _local(at: Evaluation, errors: Sequence[float], on_model: OnModel) -> Linearization:
@@ -184,7 +190,10 @@ class _LeastSquares:
         scores = self.scores_per_x @ (self.origin + x)
         at = self.best
         if not np.allclose(scores, at.scores, rtol=0, atol=1e-12):
-            at = self.objective.evaluate(at.weights, scores)
+            try:
+                at = self.objective.evaluate(at.weights, scores)
+            except InputError:  # errors that are beyond the model together: dogbox takes a shorter step
+                return np.full(sum(len(found.residuals()) for found in at.matches) + len(scores), np.nan)
             self.on_model(f"{min(at.chi2, self.best.chi2) / self.objective.pixels:.4g} per pixel")
             if at.cost >= self.best.cost and _settled(self.found, self.best, at):
                 raise _Converged

@@ -10,7 +10,16 @@ from doedesign.calibration.fit import search
 from doedesign.calibration.objective import FitObjective, Linearization
 from doedesign.calibration.target import match
 from doedesign.calibration.uncertainty import Reading, cost_rises, left_out, posterior_of, readings
-from tests.doedesign.analytic_plate import NEAR_M, NOISE, SIDE, SIGMA, AnalyticModel, analytic_objective
+from fab.errors import InputError
+from tests.doedesign.analytic_plate import (
+    NEAR_M,
+    NOISE,
+    SIDE,
+    SIGMA,
+    AnalyticImages,
+    AnalyticModel,
+    analytic_objective,
+)
 
 TRUTH = np.array([1.3, -0.4])
 # Radii of the blur and of the first dark ring of the lens, in pixels.
@@ -134,6 +143,33 @@ def test_the_search_through_the_range_stays_within_two_standard_deviations(monke
     farthest = abs(np.array(seen) / SIGMA).max(axis=0)
     assert (farthest <= 2 + 1e-9).all()
     assert (farthest > 1.7).all()  # 60 points of a square: with odds of one in 1e4 none comes so near its edge
+
+
+def test_plates_beyond_the_model_are_passed_over(monkeypatch: pytest.MonkeyPatch):
+    """Some errors are refused together only, so that no range of one of them keeps them away."""
+    monkeypatch.setattr("doedesign.calibration.fit._SHIFTS", ())
+    objective, plate, refused = analytic_objective(np.array([3.0, 0.2]), waves=1.0), AnalyticModel.plate, []
+
+    def limited(model: AnalyticModel, values: np.ndarray) -> AnalyticImages:
+        if values[0] / SIGMA[0] - values[1] / SIGMA[1] > 1.5:  # a fifth of the square that is looked through
+            refused.append(values)
+            raise InputError("overlay", "must stay below", f"{values}", "Align better.")
+        return plate(model, values)
+
+    monkeypatch.setattr(AnalyticModel, "plate", limited)
+    found = search(objective, evaluations=60, seed=4)
+    assert refused
+    assert posterior_of(found).values == pytest.approx([3.0, 0.2], abs=0.05)
+
+
+def test_a_mean_outside_the_range_leaves_a_range_to_search(monkeypatch: pytest.MonkeyPatch):
+    """Two standard deviations of 2 round a mean of 7 lie beyond a range that ends at 2.5."""
+    monkeypatch.setattr("doedesign.calibration.fit._SHIFTS", ())
+    mean, low, high = np.array([7.0, 0.0]), np.array([-3.0, -2.5]), np.array([2.5, 2.5])
+    start, words = np.array([2.5, 0.0]), list[str]()
+    objective = analytic_objective(np.array([3.0, 0.2]), waves=1.0, mean=mean, low=low, high=high, start=start)
+    search(objective, evaluations=20, on_model=words.append)
+    assert [word for word in words if word.startswith("global")]
 
 
 def test_steps_go_on_until_the_images_are_explained():

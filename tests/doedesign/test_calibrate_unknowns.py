@@ -95,3 +95,8 @@ def test_a_search_without_end_or_a_seed_below_0_is_refused(number: str):
     wrong: dict[str, Any] = {number: -1}
     with pytest.raises(InputError, match=f"{number}: must be 0 or more, but got -1"):
         calibrate(Path("none"), Path("none.toml"), **wrong)
+
+
+def test_a_seed_is_a_number_that_the_search_takes():
+    with pytest.raises(InputError, match=r"seed: must be below 2\^63, but got 18446744073709551616"):
+        calibrate(Path("none"), Path("none.toml"), seed=2**64)

@@ -36,6 +36,23 @@ def test_the_same_seed_finds_the_same(name: str):
     assert (found[1] != found[2]) == (name in ("crs", "isres"))
 
 
+@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+@pytest.mark.parametrize("when", [3, 40])  # of the first points of a random search, and of those that follow
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, ZeroDivisionError])
+def test_an_error_in_the_loss_ends_a_search_and_comes_back_as_it_is(name: str, when: int, kind: type[BaseException]):
+    seen = []
+
+    def loss(values: np.ndarray) -> float:
+        seen.append(values)
+        if len(seen) == when:
+            raise kind
+        return bumpy(np.clip(values, LOW, HIGH))
+
+    with pytest.raises(kind):
+        least(loss, LOW, HIGH, [(name, 60), ("sbplx", 20)], step=0.1)
+    assert len(seen) == when
+
+
 def test_evaluations_are_counted_and_the_best_of_all_is_kept():
     seen = []
 
