@@ -161,7 +161,9 @@ def calibrate(
         raise InputError("seed", "must be below 2^63", seed, "Leave it out, or give another.")
     design = open_design(design, masks)
     prior = design.process(process)
-    unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # refuses mistakes before files are read
+    grid = design.camera.grid
+    corner_m = float(np.hypot(*grid.extent_m)) / 2
+    unknowns = unknowns_of(prior, errors, grid.pitch_m, corner_m)  # refuses mistakes before files are read
     if not isinstance(measurement, Measurement):
         measurement = read_measurement(Path(measurement), design.camera)
     if design.camera.beam is not None:

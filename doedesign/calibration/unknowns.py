@@ -66,7 +66,9 @@ class Unknowns:
         return variation_of(self.process.masks, {**definite_means(self.process), **found})
 
 
-def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = np.inf) -> Unknowns:
+def unknowns_of(
+    process: Process, errors: Sequence[str] = (), pitch_m: float = np.inf, radius_m: float = 0.0
+) -> Unknowns:
     """Choose what to look for.
 
     Args:
@@ -74,6 +76,7 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
         errors: names of `fab.process.DEVIATIONS`, with or without unit, flat names such as "overlay_x[2]", or sources
             such as "overlay"; by default depth and line width common to all masks, and overlay.
         pitch_m: pitch of the DOE's cells, which bounds what can be followed.
+        radius_m: distance of the DOE's corners from its middle, where masks that are turned lie off most.
 
     Raises:
         InputError: an unknown error, or one that no single DOE has in a definite way (roughness).
@@ -91,8 +94,8 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
                 covariance[i, j] += _reference_sigma(process, _key(one)) ** 2
     root = np.linalg.cholesky(covariance)
     reach = _REACH * np.sqrt(np.diag(covariance))
-    limits = np.array([_limit(name, names, pitch_m) for name in names])
-    low, high = np.maximum(mean - reach, -limits), np.minimum(mean + reach, limits)
+    limits = np.array([_limits(name, names, process, pitch_m, radius_m) for name in names])
+    low, high = np.maximum(mean - reach, limits[:, 0]), np.minimum(mean + reach, limits[:, 1])
     one_sided = np.array([deviation_of(name).one_sided for name in names])
     low = np.where(one_sided, np.maximum(low, 0.0), low)
     for name, least, most in zip(names, low, high, strict=True):
@@ -158,13 +161,26 @@ def chosen_names(masks: int, errors: Sequence[str], where: str = "errors") -> tu
     return tuple(name for name in known if name in chosen)
 
 
-def _limit(name: str, names: Sequence[str], pitch_m: float) -> float:
-    """Largest size of an error that the model follows."""
+def _limits(name: str, names: Sequence[str], process: Process, pitch_m: float, radius_m: float) -> tuple[float, float]:
+    """Least and greatest value of an error that the model follows."""
     key = _key(name)
     if deviation_of(name).source == "cd":
-        # The common bias and a mask's own add up.
-        both = len({_key(n) for n in names if deviation_of(n).source == "cd"})
-        return _WIDEST_BIAS * pitch_m / both
-    if key in ("overlay_y_m", "overlay_x_m"):
-        return _LARGEST_SHIFT * pitch_m
-    return {"corner_radius_m": _LARGEST_CORNER * pitch_m, "sidewall_rad": _STEEPEST}.get(key, np.inf)
+        return _bias_limits_m(name, names, process, _WIDEST_BIAS * pitch_m)
+    farthest_m = float(np.hypot(*process.die_m)) + radius_m  # from the middle of the wafer
+    limit = {
+        **dict.fromkeys(("overlay_y_m", "overlay_x_m"), _LARGEST_SHIFT * pitch_m),
+        **dict.fromkeys(("rotation_rad", "magnification"), _LARGEST_SHIFT * pitch_m / (farthest_m or 1e-9)),
+        "corner_radius_m": _LARGEST_CORNER * pitch_m,
+        "sidewall_rad": _STEEPEST,
+    }.get(key, np.inf)
+    return -limit, limit
+
+
+def _bias_limits_m(name: str, names: Sequence[str], process: Process, widest_m: float) -> tuple[float, float]:
+    """Limits of a bias: that of a mask and the common one add up, and those not looked for stay at their means."""
+    both = len({_key(n) for n in names if deviation_of(n).source == "cd"}) > 1
+    beside = error_names(process.masks, "cd_bias_m" if name == "common_cd_bias_m" else "common_cd_bias_m")
+    means = [process.spreads.get(n, Normal()).mean for n in beside if n not in names]
+    least, most = min(means, default=0.0), max(means, default=0.0)
+    low, high = -widest_m - least, widest_m - most
+    return (max(low, -widest_m / 2), min(high, widest_m / 2)) if both else (low, high)

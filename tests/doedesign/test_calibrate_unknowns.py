@@ -14,6 +14,8 @@ from fab.process import Normal, Process
 
 PITCH_M = 2e-6
 LEVELS = Levels(4, 0.3e-6)
+# Five standard deviations of two masks, of which neither is known.
+LARGEST = {"rotation": 5 * np.sqrt(2) * 3e-4, "magnification": 5 * np.sqrt(2) * 3e-5}
 
 
 def process(**spreads: Normal) -> Process:
@@ -36,6 +38,27 @@ def test_nothing_is_looked_for_beyond_what_the_model_follows(errors: list[str], 
     found = unknowns_of(wide, errors, PITCH_M)
     np.testing.assert_allclose(found.high, limit)
     np.testing.assert_allclose(found.low, 0.0 if errors == ["sidewall"] else -limit)
+
+
+def test_a_bias_that_is_not_looked_for_takes_its_part_of_the_range():
+    """Of 0.9 um that a cell of 2 um can lose to either side, where mask 1 has 0.3 um and all have 0.2 um."""
+    means = {"common_cd_bias_m": Normal(0.2e-6, 5e-6), "cd_bias_m[1]": Normal(0.3e-6, 5e-6)}
+    wide = process(**means)
+    own, common = (unknowns_of(wide, [error], PITCH_M) for error in ("cd_bias[1]", "common_cd_bias"))
+    assert [*own.low, *own.high] == pytest.approx([-1.1e-6, 0.7e-6])
+    # Mask 0 has none, which bounds what is taken away, mask 1 what is added.
+    assert [*common.low, *common.high] == pytest.approx([-0.9e-6, 0.6e-6])
+    both = unknowns_of(wide, ["common_cd_bias", "cd_bias[0]"], PITCH_M)
+    assert both.high == pytest.approx([0.45e-6, 0.45e-6])
+
+
+@pytest.mark.parametrize("error", ["rotation", "magnification"])
+def test_masks_that_are_turned_lie_off_by_two_and_a_half_cells_at_most(error: str):
+    """At the corner of the DOE that is farthest from the middle of the wafer, 30 mm and 3 mm."""
+    off = Process(LEVELS, die_m=(0.0, 30e-3))
+    assert unknowns_of(off, [error], PITCH_M, 3e-3).high == pytest.approx([min(2.5 * PITCH_M / 33e-3, LARGEST[error])])
+    middle = Process(LEVELS)
+    assert unknowns_of(middle, [error], PITCH_M).high == pytest.approx([LARGEST[error]])
 
 
 def test_corners_are_rounded_by_half_a_cell_at_most():
