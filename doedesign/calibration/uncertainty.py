@@ -22,6 +22,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from doedesign.calibration.forward_model import DoeImages
+from doedesign.calibration.geometry import REACH
 from doedesign.calibration.objective import Evaluation, Linearization, Scores
 from doedesign.calibration.target import Image, match
 from fab.errors import InputError
@@ -146,8 +147,10 @@ def left_out(fit: Linearization) -> list[float]:
     for i, found in enumerate(at.matches):
         step = np.linalg.solve(fit.half_hessian - fit.hessians[i], sum(fit.descents, -at.scores) - fit.descents[i])
         scores = at.scores.copy()
-        # The image's own motion stays what it was.
+        # The image's own motion stays what it was; the camera is off by no more than the model follows.
         scores[: objective.shared] += step[: objective.shared]
+        camera = slice(objective.errors, objective.shared)
+        scores[camera] = np.clip(scores[camera], -REACH, REACH)
         image = objective.model.plate(objective.values(scores)).image(i, objective.motion(scores, i))
         out.append(match(found.target, found.weights, image).chi2_per_pixel)
     return out

@@ -9,9 +9,9 @@ from doedesign.calibration.estimate import remarks_on
 from doedesign.calibration.fit import search
 from doedesign.calibration.geometry import GeometryPrior, geometry_text, places
 from doedesign.calibration.measurement import load_measurement
-from doedesign.calibration.uncertainty import posterior_of
+from doedesign.calibration.uncertainty import left_out, posterior_of
 from fab.errors import InputError
-from tests.doedesign.analytic_plate import NOISE, SIDE, analytic_calibration, analytic_objective
+from tests.doedesign.analytic_plate import NOISE, SIDE, AnalyticImages, analytic_calibration, analytic_objective
 
 TRUTH = np.array([1.3, -0.4])
 STOOD = (0.01, -0.02, 0.015, 0.3)
@@ -133,6 +133,21 @@ def test_how_the_camera_stood_is_found_with_its_uncertainty():
     assert (posterior.geometry_sigma < np.array(LOOSE.sigma)).all()
     assert posterior.correlation.shape == (6, 6)
     np.testing.assert_allclose(np.diag(posterior.correlation), 1)
+
+
+def test_an_image_is_predicted_from_the_others_with_a_camera_that_the_model_follows(monkeypatch: pytest.MonkeyPatch):
+    """Where the others say little of it, one linear step may lead anywhere, and light of such places is no number."""
+    found = search(analytic_objective(TRUTH, geometry=LOOSE, stood=STOOD))
+    seen, image = [], AnalyticImages.image
+
+    def kept(images: AnalyticImages, index: int, motion: np.ndarray) -> np.ndarray:
+        seen.append(motion[3:])
+        return image(images, index, motion)
+
+    monkeypatch.setattr(AnalyticImages, "image", kept)
+    left_out(found._replace(descents=tuple(1e4 * each for each in found.descents)))
+    away = abs(np.array(seen)) / LOOSE.sigma
+    assert away.max() == pytest.approx(4.0)
 
 
 def test_a_camera_that_is_known_is_not_looked_for():
