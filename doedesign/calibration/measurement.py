@@ -60,6 +60,7 @@ def _seconds(value: Any) -> float:
 
 Exposure = Annotated[float, BeforeValidator(_seconds)]
 Share = Annotated[float, Field(strict=True, gt=0, le=1)]
+_FEWEST = 16  # pixels per side
 
 
 class ImageSpec(SpecTable, frozen=True):
@@ -165,7 +166,7 @@ class MeasurementSpec(SpecTable, frozen=True):
     image: tuple[ImageSpec, ...] = Field(min_length=1)
     mode_field_m: Annotated[float, length(0.1 * UM, 1 * MM)] | None = Field(None, examples=['"3.5 um"'])
     collimator_m: Annotated[float, length(1 * MM, 10.0)] | None = Field(None, examples=['"100 mm"'])
-    window: Annotated[int, Field(strict=True, ge=16, le=8192)] | None = Field(None, examples=["256"])
+    window: Annotated[int, Field(strict=True, ge=_FEWEST, le=8192)] | None = Field(None, examples=["256"])
     fill_factor: Share | None = Field(None, examples=["0.9"])
     saturation: Positive | None = Field(None, examples=["4095"])
     channel: Channel | None = None
@@ -268,7 +269,7 @@ def read_measurement(path: Path, camera: Camera) -> Measurement:
 
     merged = [_merged(path, spec, image, read) for image in spec.image]
     smallest = min(min(psf.rate.shape) for psf in merged)
-    window = spec.window or min(round(camera.window * camera.pixel_m / spec.pixel_m), smallest)
+    window = spec.window or _window_of(path, spec.pixel_m, camera, smallest)
     images, full = [], {}
     for image, psf in zip(spec.image, merged, strict=True):
         try:
@@ -279,6 +280,17 @@ def read_measurement(path: Path, camera: Camera) -> Measurement:
         if full[image.called] and spec.channel is None:
             log.info(f"{image.called}: {full[image.called]} pixels are full in every exposure and left out")
     return Measurement(spec, tuple(images), window, digests, full)
+
+
+def _window_of(path: Path, pixel_m: float, camera: Camera, smallest: int) -> int:
+    """Pixels of the images per side of the design's window, of which the smallest image may hold fewer."""
+    covered = round(camera.window * camera.pixel_m / pixel_m)
+    if min(covered, smallest) < _FEWEST:
+        rule = f"the images and the design's window must share at least {_FEWEST} pixels per side"
+        field = format_length(camera.window * camera.pixel_m)
+        got = f"{covered} of {format_length(pixel_m)} in {field}, and {smallest} in the smallest image"
+        raise InputError(f"{path}: pixel", rule, got, "Correct the pixel pitch, or give whole frames and a `window`.")
+    return min(covered, smallest)
 
 
 def _turned(spec: MeasurementSpec, picture: np.ndarray) -> np.ndarray:

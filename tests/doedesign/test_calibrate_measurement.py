@@ -135,6 +135,15 @@ def test_a_window_of_other_pixels_covers_the_same_field(tmp_path: Path):
         assert read_measurement(written(tmp_path, text.replace("1.85 um", pixel)), design.camera).window == window
 
 
+@pytest.mark.parametrize(("pixel", "covered"), [("3 um", 15), ("80 um", 1), ("200 um", 0)])
+def test_pixels_so_wide_that_the_design_covers_hardly_any_are_refused(tmp_path: Path, pixel: str, covered: int):
+    """A pitch in the wrong unit: 24 pixels of 1.85 um are a few of these."""
+    path = photographed(tmp_path, spot(), "")
+    written(tmp_path, path.read_text().replace("1.85 um", pixel))
+    with pytest.raises(InputError, match=rf"\.toml: pixel: .* at least 16 pixels per side, but got {covered} of"):
+        read_measurement(path, plate_drawn(32, 4, window=24).camera)
+
+
 def test_brackets_become_images(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     design = plate_drawn(96, 4, window=48)
     lights = light_of(design, usual_process(design), {}, (6e-3, np.inf))
