@@ -14,6 +14,7 @@ effects added; where along it the ratio is met is then found with the model itse
 """
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -49,6 +50,7 @@ _DEFAULT = (
     *("common_depth_scale", "depth_scale", "radial_nonuniformity", "overlay_x_m", "common_cd_bias_m", "cd_bias_m"),
     *("corner_radius_m", "sidewall_rad", "etch_lag"),
 )
+_MOST_REACH = 1000  # standard deviations
 _CLOSE = 0.01  # standard deviations to which a crossing is found
 _ANGLES = 120  # proportions of a pair that are tried on the sum of effects
 _LEAST_SHARE = 0.2  # of a pair's length that each of its errors has at least
@@ -179,6 +181,11 @@ class _ScoredModel:
     on_model: OnModel
     computed: dict[tuple[tuple[str, float], ...], dict[str, Any] | None] = field(default_factory=dict)
 
+    @property
+    def lengths(self) -> list[float]:
+        """Every standard deviation of the reach, and its end."""
+        return [*map(float, range(1, math.ceil(self.reach))), float(self.reach)]
+
     def values(self, scores: Mapping[str, float]) -> dict[str, float]:
         means = self.process.spreads
         return {name: means.get(name, Normal()).mean + z * self.sigma[name] for name, z in scores.items()}
@@ -217,14 +224,15 @@ class _ScoredModel:
     def crossing(self, direction: Mapping[str, float], start: float = 0.5) -> Mapping[str, float] | None:
         """First scores along a ray (a direction of length 1) at which the ratio is the measured one.
 
-        The ray is looked at where it starts, at `start`, and beyond it at every standard deviation.
+        The ray is looked at where it starts, at `start`, beyond it at every standard deviation, and at its end.
         """
 
         def at(length: float) -> dict[str, float]:
             return {name: length * share for name, share in direction.items()}
 
+        start = min(start, self.reach)
         last, below = 0.0, self.excess({})
-        for stop in [start, *np.arange(np.floor(start) + 1, self.reach + 1e-9)]:
+        for stop in [start, *(length for length in self.lengths if length > start)]:
             above = self.excess(at(stop))
             if np.isnan(above):
                 return None
@@ -256,8 +264,8 @@ class _ScoredModel:
     def whole_curve(self, name: str) -> Curve:
         """The curve of an error to the end of the reach, either way, or as far as the model describes it."""
         for sign in (1.0, -1.0):
-            for score in np.arange(1, self.reach + 1e-9):
-                if self.row({name: sign * float(score)}) is None:
+            for score in self.lengths:
+                if self.row({name: sign * score}) is None:
                     break
         return self.curve(name)
 
@@ -290,13 +298,11 @@ def explain_ratio(
         out: folder for the explanations and their picture; without one they stay in memory.
 
     Raises:
-        InputError: an unknown error, a ratio that is not positive, or a depth at which there is no disc.
+        InputError: an unknown error, a number that is not positive, or a depth at which there is no disc.
     """
     design = open_design(design, masks)
     prior = design.process(process)
-    if not 0 < targets.ring_to_disc < np.inf:
-        cure = "Give ring energy over disc energy."
-        raise InputError("ring_to_disc", "must be positive", targets.ring_to_disc, cure)
+    _require_possible(targets, reach)
     if design.camera.defocus_radius_m(targets.depth_m) < design.camera.pixel_m:
         rule = "the source must be near enough to be blurred by more than a pixel"
         raise InputError("depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
@@ -312,6 +318,25 @@ def explain_ratio(
             write_explanations(fresh, design.name, found)
     log.info(str(found))
     return found
+
+
+def _require_possible(targets: Targets, reach: float) -> None:
+    """Refuse numbers that nothing can have, or that cannot be looked at."""
+    positive = "must be positive"
+    for name, value, cure in (
+        ("probe", targets.wavelength_m, 'For example "520 nm".'),
+        ("depth", targets.depth_m, 'For example "10 cm".'),
+        ("throughput_sigma", targets.throughput_sigma, "For example 0.02."),
+    ):
+        if not value > 0:
+            raise InputError(name, positive, value, cure)
+    if not 0 < targets.ring_to_disc < np.inf:
+        raise InputError("ring_to_disc", positive, targets.ring_to_disc, "Give ring energy over disc energy.")
+    if targets.throughput is not None and not 0 < targets.throughput <= 1:
+        rule = "must be a share of the light, above 0 and up to 1"
+        raise InputError("throughput", rule, targets.throughput, "Write 0.86.")
+    if not 0 < reach <= _MOST_REACH:
+        raise InputError("reach", f"must be above 0 and up to {_MOST_REACH}", reach, "For example 4.")
 
 
 def _explained(model: _ScoredModel, pairs: bool) -> ExplanationSet:

@@ -186,10 +186,6 @@ def calibrate(
         lengths[option] = length_of(option, text)
         if not lengths[option] > 0:
             raise InputError(option, "must be positive", text, cure)
-    if throughput is not None and not 0 < throughput <= 1:
-        raise InputError("--throughput", "must be a share of the light, above 0 and up to 1", throughput, "Write 0.86.")
-    if not (throughput_sigma > 0 and reach > 0):
-        raise InputError("--throughput-sigma, --reach", "must be positive", (throughput_sigma, reach), "Correct them.")
     targets = Targets(lengths["--probe"], lengths["--depth"], ring_to_disc or 0.0, throughput, throughput_sigma)
     folder = out or run / "explanations"
     with measured(run, "calibrate", writes=folder) as taken:

@@ -16,6 +16,7 @@ from tests.doedesign.calibration_fakes import PROBE_M, plate_drawn, usual_proces
 NEAR_M = 6e-3
 BOTH = ("common_depth_scale", "common_cd_bias")
 DEPTH_SIGMA, CD_SIGMA = 0.03, 0.15e-6
+SHORT = ("common_depth_scale", "common_cd_bias_m")
 LN2 = np.log(2)
 
 
@@ -76,6 +77,35 @@ def test_curves_are_the_ratio_at_every_standard_deviation(
     assert list(curve.scores) == sorted(curve.scores)
     np.testing.assert_allclose(curve.ring_to_disc, 3 * np.exp(-0.4 * np.array(curve.scores)))
     np.testing.assert_allclose(curve.throughput, 0.9 - 0.02 * np.array(curve.scores))
+
+
+@pytest.mark.parametrize(("reach", "found"), [(1.7, []), (1.75, ["common_depth_scale"]), (0.3, []), (4, [*SHORT])])
+def test_errors_are_followed_to_the_end_of_the_reach_and_no_further(
+    plate: tuple[Design, Process], monkeypatch: pytest.MonkeyPatch, reach: float, found: list[str]
+):
+    """The ratio is met at ln 2 / 0.4 = 1.733 and at 2.310 standard deviations."""
+    made = explained(plate, monkeypatch, pairs=False, reach=reach)
+    assert [next(iter(each.scores)) for each in made.singles] == found
+    assert max(made.curves["common_depth_scale"].scores) <= reach
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule"),
+    [
+        ({"throughput": 0.9, "throughput_sigma": 0.0}, "throughput_sigma: must be positive"),
+        ({"throughput": 90.0}, "throughput: must be a share of the light"),
+        ({"ring_to_disc": np.nan}, "ring_to_disc: must be positive"),
+        ({"depth_m": 0.0}, "depth: must be positive"),
+        ({"wavelength_m": -520e-9}, "probe: must be positive"),
+        ({"reach": 0.0}, "reach: must be above 0 and up to 1000"),
+    ],
+)
+def test_numbers_that_nothing_can_have_are_refused(
+    plate: tuple[Design, Process], monkeypatch: pytest.MonkeyPatch, changes: dict[str, float], rule: str
+):
+    targets = Targets(PROBE_M, NEAR_M, 1.5)._replace(**{k: v for k, v in changes.items() if k != "reach"})
+    with pytest.raises(InputError, match=rule):
+        explained(plate, monkeypatch, targets=targets, reach=changes.get("reach", 4.0))
 
 
 def test_two_errors_share_as_is_most_plausible(plate: tuple[Design, Process], monkeypatch: pytest.MonkeyPatch):
