@@ -89,7 +89,7 @@ class Study:
 
         Raises:
             InputError: no such key, none of the draws can be evaluated (nor the nominal or the expected one, where
-                they are asked for), or a folder that cannot be used.
+                they are asked for), a limit that concerns none of their rows, or a folder that cannot be used.
         """
         keys = list(dict.fromkeys(keys))
         if not all(key in self.journal.finished for key in keys):
@@ -102,13 +102,16 @@ class Study:
                 rule, cure = "must be within what can be evaluated", "Lower the means and sigmas of the errors."
                 raise InputError(f"draw {key}", rule, f'"{beyond[key]}"', cure)
         try:
-            return sample_of({key: self.journal.finished[key] for key in keys}, self.limits)
+            found = sample_of({key: self.journal.finished[key] for key in keys}, self.limits)
         except ValueError as error:
             if self.journal.folder is None:
                 raise
             path = self.journal.folder / DrawLines.file
             cure = f"Remove {path} to compute all draws again."
             raise InputError(str(path), "all draws must have the same rows", f'"{error}"', cure) from error
+        # Of draws that were all there, too, a limit that concerns none of the rows is refused before it is counted on.
+        _ = found.good
+        return found
 
     def beyond(self, keys: Sequence[str]) -> dict[str, str]:
         """Why some of these draws could not be evaluated, by key; they count as bad."""

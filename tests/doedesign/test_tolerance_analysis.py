@@ -365,6 +365,20 @@ def test_results_take_the_place_of_older_ones_and_of_nothing_else(
     assert letter.read_text() == "mine"
 
 
+def test_a_limit_on_what_is_not_there_leaves_earlier_results(
+    toleranced: Callable[..., ToleranceResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """All draws are on the disk by then, so that nothing is evaluated that could tell."""
+    leave_out_pictures(monkeypatch, result_files)
+    monkeypatch.setattr(ToleranceResult, "plot", lambda _: None)
+    monkeypatch.setattr(result_files, "evaluate_here", lambda model, plates, workers: ((key, None) for key in plates))
+    toleranced(out=tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(InputError, match="limit on far_spot: must match a colour and depth"):
+        toleranced(limits=["far_spot >= 0.3 at 7 m"], out=tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_a_result_in_words_ends_with_the_sigmas_that_a_budget_allows(toleranced: Callable[..., ToleranceResult], fakes):
     few = toleranced(sensitivity="none")
 
