@@ -41,6 +41,7 @@ from doedesign.runs.folder import (
     is_finished,
     named,
     open_run,
+    require_room,
 )
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
@@ -245,7 +246,8 @@ def precompensate(
     aim = drawn.aim or drawn.level_map
     design = replace(drawn, level_map=aim, edge_moves_m=(), aim=None)
     made_by = replace(made_by, levels=aim.levels)
-    folder = Path(out or Path("runs") / _next_name(drawn))
+    name = named(drawn.spec, _next_name(drawn)).name  # one that is too long is refused now
+    folder = Path(out or Path("runs") / name)
     if folder.resolve() == run.folder.resolve():
         raise InputError(str(folder), "the new run needs a folder of its own", "that of the run", "Give another.")
     files, by = _files(drawn.spec), by or ("loss" if drawn.spec.aims else "psfs")
@@ -266,7 +268,7 @@ def precompensate(
     terms = terms_from_spec(drawn.spec, design.camera, files, objectives)
     task = _Task(design, made_by, _loss_of(design, terms) if by == "loss" else _difference_from(design))
     commands = task.search(evaluations)
-    compensated = _compensated(task, commands, _next_name(drawn))
+    compensated = _compensated(task, commands, name)
     assert compensated.spec is not None
     with claim_run(folder, compensated.spec, inputs, overwrite=overwrite) as claimed:
         _write(claimed, task, compensated, terms, commands, about)
@@ -276,6 +278,7 @@ def precompensate(
 def _finished(folder: Path, inputs: dict[str, str], *, overwrite: bool) -> Design | None:
     """The design of a folder that holds this pre-compensation, done; an InputError for one that holds another run."""
     # The spec of the new run is known after the search alone.
+    require_room(folder)
     before = inputs_of_run(folder)
     if before == inputs:
         if not is_finished(folder):

@@ -194,13 +194,9 @@ def claim_run(
         InputError: the folder belongs to another spec, to other inputs, or to something else altogether; its
             results changed since; or another process works in it.
     """
-    cure = "Choose another output folder."
-    if folder.exists() and not folder.is_dir():
-        raise InputError(str(folder), "a run needs a folder", "a file", cure)
+    _require_no_file(folder)
     with alone_in(folder), restored_unless_replaced(folder):
-        known = (folder / MANIFEST_NAME).is_file()
-        if not known and any(folder.iterdir()):
-            raise InputError(str(folder), "a run needs a new or empty folder, or its own", "other content", cure)
+        known = _is_known(folder)
         if known and overwrite and not _belongs(_read_manifest(folder), spec, inputs):
             set_aside(folder)
             known = False
@@ -208,6 +204,35 @@ def claim_run(
         if run.done:  # perhaps stopped before the last line of `finish_run`
             run.path(CHECKPOINT).unlink(missing_ok=True)
         yield run
+
+
+def require_room(folder: Path) -> None:
+    """Refuse a folder in which no run can be, before anything takes time; `claim_run` looks again.
+
+    Args:
+        folder: the folder for a run, which may be missing.
+
+    Raises:
+        InputError: it holds something else, or is a file, or another process works in it.
+    """
+    _require_no_file(folder)
+    if folder.is_dir() and not waits(folder):
+        with alone_in(folder):
+            _is_known(folder)
+
+
+def _require_no_file(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(str(folder), "a run needs a folder", "a file", "Choose another output folder.")
+
+
+def _is_known(folder: Path) -> bool:
+    """Whether there is a run in a folder, or nothing; an InputError for other content."""
+    known = (folder / MANIFEST_NAME).is_file()
+    if not known and any(folder.iterdir()):
+        rule, cure = "a run needs a new or empty folder, or its own", "Choose another output folder."
+        raise InputError(str(folder), rule, "other content", cure)
+    return known
 
 
 def _belongs(found: "_Manifest", spec: Spec, inputs: Mapping[str, str]) -> bool:

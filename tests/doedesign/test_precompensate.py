@@ -291,13 +291,29 @@ def test_mistakes_are_told(run: Path, tmp_path: Path, settings: dict[str, object
     assert not (tmp_path / "new").exists()
 
 
-def test_a_folder_of_something_else_is_refused(run: Path, estimate: Path, tmp_path: Path):
+def test_a_folder_of_something_else_is_refused_before_the_search(
+    run: Path, estimate: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def searched(*_: object) -> None:
+        raise AssertionError("searched before the folder was looked at")
+
+    monkeypatch.setattr(precompensation._Task, "search", searched)
     with pytest.raises(InputError, match="needs a folder of its own"):
         precompensate(run, run, process=estimate)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
     with pytest.raises(InputError, match="other content"):
         precompensate(run, tmp_path / "full", process=estimate, evaluations=0)
+    with pytest.raises(InputError, match="a run needs a folder, but got a file"):
+        precompensate(run, estimate, process=estimate, evaluations=0)
+
+
+def test_a_name_that_would_be_too_long_is_refused_before_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delattr(precompensation._Task, "search")
+    run = finished_run(tmp_path, WITHOUT_OBJECTIVE.replace("small", "n" * 62))
+    (tmp_path / "estimate.toml").write_text(ESTIMATE)
+    with pytest.raises(InputError, match="must have 64 letters at most"):
+        precompensate(run, tmp_path / "new", process=tmp_path / "estimate.toml")
 
 
 def test_edges_are_given_by_mask_or_by_the_process(tmp_path: Path):
