@@ -102,8 +102,8 @@ def refine(
         overwrite: where the folder has another run, remove it with all that was made of it.
 
     Raises:
-        InputError: fmmax is missing, a run that cannot be read or has no unit cell, given phases, several wavelengths,
-            tilted light, a cell that is too large, or a folder that belongs to something else.
+        InputError: fmmax is missing, a run that cannot be read, has no unit cell or is pre-compensated, given phases,
+            several wavelengths, tilted light, a cell that is too large, or a folder that belongs to something else.
     """
     require_fmmax()
     run = source if isinstance(source, Run) else open_run(Path(source))
@@ -168,6 +168,9 @@ def _cell_of(design: Design) -> _Cell:
     if spec.spots.phases_rad:
         rule, cure = "orders are refined for their light alone", "Leave out spots.phases."
         raise InputError(design.name, rule, "phases that are given", cure)
+    if design.aim is not None:
+        rule, cure = "a cell is refined for the depths that come out", "Refine the run that it was made from instead."
+        raise InputError(design.name, rule, "etches that make up for a process (precompensate)", cure)
     wavelengths = sorted({line.wavelength_m for line in camera.lines})
     if len(wavelengths) > 1:
         got = ", ".join(map(format_length, wavelengths))

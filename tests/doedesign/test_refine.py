@@ -223,6 +223,7 @@ def test_what_has_no_cell_for_one_wavelength_is_refused(run: Path, monkeypatch: 
     for other, words in (
         (replace(design, spec=spec.model_copy(update={"spots": None})), "only the unit cell of a grid of orders"),
         (replace(design, spec=given), "refined for their light alone, but got phases that are given"),
+        (replace(design, aim=level_map), "for the depths that come out, but got etches that make up for a process"),
         (replace(design, camera=two), "for one wavelength, but got 532 nm, 633 nm"),
         (replace(design, camera=tilted), "normal incidence, but got 0, 5.73 degrees along y and x"),
         (replace(design, level_map=small), "must hold a whole period of 2.4 um"),
