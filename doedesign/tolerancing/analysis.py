@@ -208,10 +208,21 @@ def _places(rows: Rows) -> tuple[tuple[str, float], ...]:
 
 def _moments(values: Float[np.ndarray, " draw"]) -> dict[str, float]:
     with np.errstate(invalid="ignore"):  # an infinite ratio has no mean
-        p05, median, p95 = np.percentile(values, [5, 50, 95])
+        p05, median, p95 = np.percentile(values, [5, 50, 95]) if np.isfinite(values).all() else _ranks(values)
         mean, std = values.mean(), values.std(ddof=1) if len(values) > 1 else 0.0
     names = ("mean", "std", "min", "p05", "median", "p95", "max")
     return dict(zip(names, map(float, (mean, std, values.min(), p05, median, p95, values.max())), strict=True))
+
+
+def _ranks(values: Float[np.ndarray, " draw"]) -> list[float]:
+    """The same percentiles of numbers of which some are infinite; numpy's next to an infinite one are NaN."""
+    ordered, places = np.sort(values), np.array([0.05, 0.5, 0.95]) * (len(values) - 1)
+    found = []
+    for place in np.round(places, 9):
+        low, share = math.floor(place), place % 1
+        below, above = ordered[low], ordered[min(low + 1, len(values) - 1)]
+        found.append(float(below if share == 0 or below == above else below + share * (above - below)))
+    return found
 
 
 _LIMIT = re.compile(r"\s*(\w+)\s*(<=|>=)\s*([-+\d.eE]+)\s*(%?)(?:\s+for\s+([\w-]+))?(?:\s+at\s+(.+?))?\s*")

@@ -103,6 +103,16 @@ def test_statistics_of_every_row_and_of_the_worst():
     assert len(found) == 4 + 2 * 4 + 2 * 2
 
 
+def test_percentiles_beside_an_infinite_ratio_are_numbers():
+    """Of 21 plates one has no light in the disc: p95 is the twentieth of them, and the rest do not know of it."""
+    ratios = [*map(float, range(1, 21)), None]
+    draws = {f"normal/{i}": [row("red", 0.05, ring_to_disc=ratio)] for i, ratio in enumerate(ratios)}
+    worst = sample_of(draws).statistics()[0]
+    assert [worst[name] for name in ("p05", "median", "p95", "max")] == [2.0, 11.0, 20.0, math.inf]
+    few = sample_of(dict(list(draws.items())[-2:])).statistics()[0]  # 20 and infinite
+    assert [few[name] for name in ("min", "p05", "max")] == [20.0, math.inf, math.inf]
+
+
 def test_plates_with_other_rows_are_refused():
     rows = [row("red", None, strehl=1.0)]
     with pytest.raises(ValueError, match="the same rows"):
