@@ -32,6 +32,7 @@ from sim.psf_bank import PsfBank
 
 NEAR_DEPTHS = 8
 _SALT_DEPTHS, _SALT_PARTS = 5, 6
+_OTHER_SEEDS = 3 << 32  # beyond those of trainings, and of what they hold out
 
 
 class PairDepths(NamedTuple):
@@ -142,7 +143,9 @@ class PairSet:
         """
         far, near = self.depths(number)
         kind = at_depth(self._part(number), (near, near))
-        return SceneData(self._pictures, kind, self._view, (far, far), self.seed, mirrored=False).item(number)
+        # A training of the same seed draws distances, where there are several, and then other obstructions than these.
+        seed = self.seed if len(self.far_m) > 1 else self.seed + _OTHER_SEEDS
+        return SceneData(self._pictures, kind, self._view, (far, far), seed, mirrored=False).item(number)
 
     @cached_property
     def _pictures(self) -> Pictures:

@@ -20,7 +20,8 @@ from skimage import data, restoration
 import doedesign.evaluation.evaluate as evaluate_module
 from doedesign.calibration.measurement import load_measurement
 from doedesign.capture.from_spec import plain_parameters
-from doedesign.capture.images import sample_files
+from doedesign.capture.images import Pictures, sample_files
+from doedesign.capture.scenes import SceneData
 from doedesign.evaluation.candidates import candidates_of
 from doedesign.evaluation.evaluate import evaluate
 from doedesign.evaluation.external import ExternalMethod
@@ -141,6 +142,20 @@ def test_a_pair_follows_from_the_seed_and_its_number(run: Path, pairs: PairSet):
     assert pairs.scene(5).name == later.name
     moved = PairSet.of(load_spec(run / "spec.toml"), "spec.toml", sample_files()[:3], seed=1)
     assert not np.array_equal(moved.scene(5).scene.background, later.scene.background)
+
+
+def test_obstructions_of_a_single_distance_are_none_of_those_of_a_training(run: Path, pairs: PairSet):
+    """With the same seed they began with the same numbers, and their masks were the same: correlation 0.999."""
+    single = PairSet.of(
+        load_spec(run / "spec.toml", ['scene.far=["1.2 m"]']), "spec.toml", sample_files()[:3], border="reflect"
+    )
+    for judged in (single, replace(pairs, model=single.model)):
+        kind, far = judged.kind, (min(judged.far_m), max(judged.far_m))
+        trained = SceneData(Pictures(judged.files), kind, judged._view, far, judged.seed)
+        for number in range(4):
+            masks = [data(number).scene.obstructions[0].mask for data in (judged.scene, trained.item)]
+            # Of 65 x 65 pixels with few clumps: those of other seeds correlate by 0.3 at most.
+            assert abs(np.corrcoef(*(np.ravel(mask) for mask in masks))[0, 1]) < 0.4
 
 
 def test_depths_are_those_whose_psfs_are_known(pairs: PairSet):
@@ -626,7 +641,7 @@ def test_a_seed_named_twice_and_what_no_row_looks_at_are_refused(run: Path, tmp_
     with pytest.raises(InputError, match="robust: has rows in table 2 alone"):
         evaluate(run, tmp_path / "out", table=1, robust=run)
     assert not (tmp_path / "out").exists()
-    with pytest.raises(InputError, match="process: is that of plates as fabricated.*but got no row with such a plate"):
+    with pytest.raises(InputError, match=r"process: is that of plates as fabricated.*but got no row with such a plate"):
         evaluate(run, tmp_path / "out", table=1, process="contact_aligner")
 
 
