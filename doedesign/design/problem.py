@@ -1,6 +1,6 @@
 """The optimisation problem of a spec: from parameters to the loss of one step, ready to differentiate."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial, reduce
 from math import isfinite
@@ -30,6 +30,18 @@ from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
 from sim.threads import at_once
 
 
+class SeenSource(NamedTuple):
+    """A source that steps look at.
+
+    Attributes:
+        wave: what an optic takes for it.
+        plan: operators for its depth; None where those of its line serve all depths (`Problem.plans`).
+    """
+
+    wave: Any
+    plan: Any = None
+
+
 class StepSources(NamedTuple):
     """Those of a `SourceSet` that one evaluation of the loss looks at, and where the image lies.
 
@@ -42,8 +54,8 @@ class StepSources(NamedTuple):
         colour: number of the one colour that is looked at, or None for all.
     """
 
-    near: tuple[tuple[Any, ...], ...]
-    far: tuple[tuple[Any, ...], ...]
+    near: tuple[tuple[SeenSource, ...], ...]
+    far: tuple[tuple[SeenSource, ...], ...]
     lens: Float[Array, "w n"]
     disc_radius_m: Float[Array, " n"]
     offset_m: Float[Array, "2"] | None
@@ -80,8 +92,8 @@ class SourceSet(NamedTuple):
         in_turn: whether a step looks at one colour, the next step at the next.
     """
 
-    near: tuple[tuple[Any, ...], ...]
-    far: tuple[tuple[Any, ...], ...]
+    near: tuple[tuple[SeenSource, ...], ...]
+    far: tuple[tuple[SeenSource, ...], ...]
     lens: Float[np.ndarray, "w n"]
     disc_radius_m: Float[np.ndarray, " n"]
     displacement_m: float
@@ -134,9 +146,14 @@ def problem_of(
     terms = terms_from_spec(spec, camera_from_spec(spec), files, functions)
     problem = replace(plans_of(spec), terms=terms)
     camera, optic = problem.camera, problem.optic
-    sources: Any = optic.source
+    exact = _is_transformed(spec) and not _is_sparse(spec)
+
+    def seen(line: SpectralLine, depth_m: float) -> SeenSource:
+        wave: Any = optic.source(line, depth_m)
+        return SeenSource(wave, optic.plan(line, depth_m) if exact else None)
+
     near, far = (
-        tuple(tuple(sources(line, depth) for depth in depths_m) for line in optic.lines)
+        tuple(tuple(seen(line, depth) for depth in depths_m) for line in optic.lines)
         for depths_m in (spec.scene.near_m, spec.scene.far_m)
     )
     lens = np.zeros((len(camera.colours), 0), np.float32)
@@ -152,10 +169,13 @@ def problem_of(
 
 def _is_sparse(spec: Spec) -> bool:
     """Whether a step takes one sample of intensity per lambda d / D."""
-    optimize = spec.optimize
+    return spec.optimize.sampling == "sparse" and _is_transformed(spec)
+
+
+def _is_transformed(spec: Spec) -> bool:
+    """Whether light of cells gets to the sensor by the transform of the far field."""
     far = camera_from_spec(spec).propagation == "far_field" and spec.optics.propagation != "fresnel"
-    transformed = optimize.parametrization != "radial" and far
-    return optimize.sampling == "sparse" and transformed
+    return spec.optimize.parametrization != "radial" and far
 
 
 def plans_of(spec: Spec) -> Problem:
@@ -169,6 +189,7 @@ def plans_of(spec: Spec) -> Problem:
     optic = RingOptic(camera, jnp.zeros(ring_count(camera))) if radial else flat
     propagation = "far_field" if radial else spec.propagation
     sampling = 1.0 if _is_sparse(spec) else None
+    far_field = radial or _is_transformed(spec)
     return Problem(
         parametrization=LevelParametrization.at(
             camera.material,
@@ -179,21 +200,12 @@ def plans_of(spec: Spec) -> Problem:
         ),
         terms=(),
         plans=tuple(
-            optic.plan(line, _planned_m(optic, propagation, depths_m), propagation, sampling) for line in optic.lines
+            # On the direct path, samples enough for the nearest source are enough for all.
+            optic.plan(line, np.inf if far_field else min(depths_m, default=np.inf), propagation, sampling)
+            for line in optic.lines
         ),
         optic=optic,
     )
-
-
-def _planned_m(optic: Any, propagation: str | None, depths_m: Sequence[float]) -> float:
-    """The depth that one plan for all depths is made for.
-
-    Samples enough for the nearest source on the direct path are enough for all; in the far field the cells' sinc stays
-    about the axis if depths differ.
-    """
-    if (propagation or optic.camera.propagation) != "far_field":
-        return min(depths_m, default=np.inf)
-    return depths_m[0] if len(depths_m) == 1 else np.inf
 
 
 Images = tuple[tuple[tuple[Array, ...], ...], tuple[tuple[Array, ...], ...]]
@@ -210,13 +222,18 @@ class _Asked(NamedTuple):
 
 def _asked(problem: Problem, look: StepSources) -> list[list[list[_Asked]]]:
     """The images of a step: `[near or far][line][depth]`."""
-    seen, plans = [], problem.plans
+    seen: list[tuple[int, SpectralLine, Any]] = []
+    plans = problem.plans
     for number, line in enumerate(problem.optic.lines):
         if look.colour in (None, line.colour):
             # Only far-field plans are displaced: see `_is_sparse`.
             plan = plans[number] if look.offset_m is None else displaced(plans[number], look.offset_m)
             seen.append((number, line, plan))
-    return [[[_Asked(line, plan, one) for one in side[n]] for n, line, plan in seen] for side in (look.near, look.far)]
+
+    def asked(line: SpectralLine, plan: Any, one: SeenSource) -> _Asked:
+        return _Asked(line, plan if one.plan is None else one.plan, one.wave)
+
+    return [[[asked(line, plan, one) for one in side[n]] for n, line, plan in seen] for side in (look.near, look.far)]
 
 
 def _energy(optic: Any, asked: _Asked) -> Float[Array, "y x"]:

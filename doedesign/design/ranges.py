@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.design.objectives import disc_radii_m
-from doedesign.design.problem import Problem, StepSources
+from doedesign.design.problem import Problem, SeenSource, StepSources
 from doedesign.spec import Spec
 from sim.metrics import participation
 from sim.optic import HeightOptic
@@ -94,7 +94,7 @@ class SourceRange:
         optic = problem.optic
         sources: Any = optic.source
         near_sources, far_sources = (
-            tuple(tuple(sources(line, depth, angles) for depth in depths) for line in optic.lines)
+            tuple(tuple(SeenSource(sources(line, depth, angles)) for depth in depths) for line in optic.lines)
             for depths in (near, far)
         )
         # The blur of a lens grows with a power of the inverse depth.

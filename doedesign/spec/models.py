@@ -228,8 +228,7 @@ class OptimizeSpec(SpecTable, frozen=True):
         sampling: "sparse" takes one FFT of the bare grid per PSF and moves the image by a random fraction of a
             pixel at every step, so that what one step misses averages out; "exact" integrates every pixel to 0.2 %
             at several times the work, with the image on the axis (for patterns that must fall on certain pixels).
-            Both keep the cells' sinc about the axis for near sources, which the reported PSFs do not; "exact" does not,
-            either, in a scene of a single depth.
+            Of near sources "sparse" keeps the cells' sinc about the axis, which "exact" and the reported PSFs do not.
         colours: "together", or "in_turn": a step looks at one colour, the next at the next. Such a step takes two
             fifths of the time, and a design half as many more of them. Not for terms that compare colours or depths.
         polish: moves of a descent on levels after the steps (`doedesign.design.descent`); each is kept only if the loss

@@ -126,7 +126,7 @@ def test_a_design_is_optimised_for_a_sensor_near_by(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize("distance", [pytest.param("3 mm", marks=pytest.mark.slow), "20 mm"])
 def test_steps_see_the_light_of_a_near_point_as_it_is_reported(tmp_path: Path, distance: str):
     """By the direct path and in the far field; steps as for a star were off by 0.07 and 0.28."""
-    spec = spec_of(tmp_path, f"sensor.distance={distance}", 'scene.far=["2.5 mm"]', "optimize.sampling=exact")
+    spec = spec_of(tmp_path, f"sensor.distance={distance}", 'scene.far=["2.5 mm", "1 m"]', "optimize.sampling=exact")
     problem, scene = problem_of(spec, {})
     height = 234.6e-9 * np.random.default_rng(2).integers(0, 8, problem.camera.grid.shape)
     seen = np.asarray(view_of(problem, jnp.asarray(height, jnp.float32), scene.first_look()).far[0, 0])

@@ -271,7 +271,7 @@ def test_sources_lie_between_the_listed_depths_and_on_all_of_the_sensor(spec: Pa
     look = task.look(3)
     drawn = task.ranges.places(((), ()), read.optimize.seed, 3)
     due = problem.optic.source(problem.optic.lines[0], drawn.near_m[0], drawn.field_rad)
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool(np.array_equal(a, b)), look.near[0][0], due))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(np.array_equal(a, b)), look.near[0][0].wave, due))
 
 
 def test_the_plain_lens_is_known_between_the_listed_depths(spec: Path) -> None:
