@@ -106,6 +106,7 @@ _OF_GROUP = (
 )
 # The same name for something else in one command.
 _APART = {
+    ("calibrate", "pairs"): _COMPUTED,
     ("refine", "terms"): _COMPUTED,
     ("evaluate", "pairs"): _COMPUTED,
     ("finetune", "validation"): _COMPUTED,

@@ -46,6 +46,17 @@ def test_what_must_be_given_has_no_default(command: str, capsys: pytest.CaptureF
     assert not [entry for entry in required if "by default" in entry or "may be left out" in entry]
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("calibrate", "--pairs"), ("refine", "--terms"), ("evaluate", "--pairs"), ("finetune", "--validation")],
+)
+def test_options_are_grouped_by_what_they_mean_here(command: str, option: str, capsys: pytest.CaptureFixture[str]):
+    main([command, "--help"])
+    panels = re.split(r"╭─ ([^─]+) ─", capsys.readouterr().out)
+    found = [title for title, text in zip(panels[1::2], panels[2::2], strict=True) if f"│ {option} " in text]
+    assert found == ["What is computed"]
+
+
 def test_nested_commands_say_things_once(capsys: pytest.CaptureFixture[str]):
     def work() -> None:
         logging.getLogger("doedesign").info("once")
