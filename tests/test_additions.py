@@ -27,6 +27,7 @@ PLACES = {
     "An obstruction": [
         ("sim/obstruction/sticker.py", "{}"),
         ("sim/obstruction/__init__.py", "{}from sim.obstruction.view"),
+        ("doedesign/spec/scene.py", '"release_dirt", "folder")\n{}'),
     ],
     "A file of an order": [
         ("fab/solids/profile_file.py", "{}"),
@@ -89,6 +90,10 @@ import sim
 view = sim.CameraView((64, 48), pixel_m=37e-6, focal_m=8e-3)
 drawn = sim.OBSTRUCTIONS["sticker"]().draw(np.random.default_rng(0), view, np.zeros((3, 64, 48), np.float32))
 assert drawn.mask.shape == (64, 48) and 0 < drawn.mask.mean() < 1 and 0.05 <= drawn.depth_m <= 0.12
+import doedesign as dd
+from doedesign.capture.from_spec import obstruction_from_spec
+spec = dd.load_spec(QUICK, obstruction={"kind": "sticker", "options": {"diameter": ["6 mm", "7 mm"]}})
+assert obstruction_from_spec(spec, QUICK).diameter_m == (6e-3, 7e-3)
 """,
     "A file of an order": """
 import fab
@@ -118,7 +123,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     chapters = re.split(r"^### ", (ROOT / "CONTRIBUTING.md").read_text(), flags=re.MULTILINE)
     blocks = {chapter.partition("\n")[0]: BLOCK.findall(chapter) for chapter in chapters}
     for name, places in PLACES.items():
-        assert len(blocks[name]) == len(places) <= 2
+        assert len(blocks[name]) == len(places) <= 3
         for (file, place), block in zip(places, blocks[name], strict=True):
             edit(copy / file, place.format(""), place.format(block.rstrip("\n") if place.endswith("){}") else block))
     for file, old, new in LISTED:

@@ -12,8 +12,8 @@
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.design.metrics`
         *.png                   pictures
-    cost.jsonl              time and memory of the commands that worked on the run; no result (`doedesign.runs.costs`)
-        psf/, fabricated/, certificate/, simulated/, trained/, tolerance/, calibrate/     results of later commands
+        cost.jsonl              time and memory of the commands that worked on the run; no result (`runs.costs`)
+        psf/, fabricated/, certificate/, simulated/, trained/, tolerance/, calibration/   results of later commands
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
