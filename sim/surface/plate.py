@@ -128,7 +128,7 @@ def as_fabricated(
         the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.
 
     Raises:
-        InputError: an error is not finite, an edge moves by half a cell or more through line-width bias, corners are
+        InputError: an error is not finite, an edge moves by more than half a cell through line-width bias, corners are
             rounded by more than half a cell, a mask is shifted by more than 8 cells, or an error has the wrong number
             of masks.
         ValueError: a level map of another shape than the grid.

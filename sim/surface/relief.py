@@ -234,7 +234,7 @@ def require_possible(grid: Grid, process: Process, variation: Variation) -> None
     limits = {"cd_bias": float(jnp.abs(effective_bias(relief)).max()), "corner_radius": variation.corner_radius_m}
     for name, value in limits.items():
         if value >= pitch_m / 2 * (1 + 1e-9):
-            rule = f"must stay below half a cell, {format_length(pitch_m / 2)}"
+            rule = f"must be at most half a cell, {format_length(pitch_m / 2)}"
             cure = "Such a process loses single pixels: draw coarser cells, or reduce the error."
             raise InputError(f"variation.{name}", rule, format_length(value), cure)
     if not 0 <= variation.sidewall_rad < np.pi / 4:
