@@ -140,7 +140,8 @@ FOLDERS: tuple[WrittenFolder, ...] = (
             WrittenFile("*_WAFER.png", "dies and marks on the wafer"),
             WrittenFile("*_MARKS.png", "an alignment site"),
             WrittenFile("*_RULES.png", "where a mask breaks the rules of the process"),
-            WrittenFile("*_DIRECT*", "one layer per level, merged, with a table of doses, with --direct-write"),
+            WrittenFile("*_DIRECT*", "one layer per level, merged, with --direct-write; OASIS, and DXF in micrometres"),
+            WrittenFile("*_DOSE.csv", "heights and depths of the levels, blanks for the doses, with --direct-write"),
             WrittenFile(
                 "manifest.json",
                 "digest, unit, layers, tone, reading sense, areas, smallest features, places, and the "

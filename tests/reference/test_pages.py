@@ -13,6 +13,7 @@ from doedesign.reference.numbers import METRICS_GROUPS
 from doedesign.reference.other_numbers import OTHER_GROUPS
 from doedesign.reference.pages import grouped, pages, public_names
 from doedesign.spec import load_variation
+from fab.solids.write import KINDS as SOLIDS
 
 ROOT = Path(__file__).parents[2]
 KINDS = ("raindrop", "fence", "all")
@@ -98,6 +99,7 @@ def test_files_of_an_order_are_described() -> None:
     entry = folder_of("masks/example")
     assert entry is not None
     names = [path.name for path in (ROOT / "masks" / "example").iterdir()]
+    names += [f"EXAMPLE_A_1P85_3253{kind.ending}" for kind in SOLIDS]  # those, too, that have to be asked for
     assert [name for name in names if described(entry, name) is None] == []
 
 
