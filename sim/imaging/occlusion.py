@@ -1,6 +1,6 @@
 """How an obstruction takes light from what is behind it: four models, written for one colour of one scene.
 
-`radiometric` follows the light (design.md §6). The bundle from a point of the background through the aperture cuts an
+`radiometric` follows the light. The bundle from a point of the background through the aperture cuts an
 obstruction's plane in a disc of diameter D · (1 - z_o / z_b), which is D · (1 - z_o / z_b) · f / (z_o · pixel) pixels
 wide (eq. 11). The share of the disc that the obstruction covers is the share of the point's light that is lost,
 whatever the DOE does; what is left lands by the far PSF, and the obstruction's own light by the near one:
