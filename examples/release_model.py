@@ -8,7 +8,7 @@ manifest of an order of the same plate. OUT gets
     network.npz     weights in half precision, what they were trained on and under which licences
     psf.exr         PSFs of the plate
     level_map.npz   the plate, with height.exr and spec.toml
-    masks.json      the manifest of its mask order, whose files can be drawn again from the level map
+    masks.json      the manifest of ORDER, where it is named; its files can be drawn again from the level map
     capture.png     a sample picture of scikit-image behind the obstruction, photographed through the plate with noise
     manifest.json   digests of all of these, how the network was trained and how it is judged
 

@@ -328,7 +328,7 @@ FOLDERS: tuple[WrittenFolder, ...] = (
             WrittenFile("spec.toml", "the spec"),
             *_DESIGN[:2],
             *_TRAINING[:2],
-            WrittenFile("masks.json", "levels and masks of the plate"),
+            WrittenFile("masks.json", "manifest of the mask order of the plate, where one was named; not for fences"),
             WrittenFile("capture.png", "a capture to try it on"),
             _MANIFEST,
         ),
