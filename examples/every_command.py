@@ -3,8 +3,9 @@
     python examples/every_command.py [FOLDER] [--spec examples/quick.toml]
 
 Refinement is shown on `examples/cell.toml`, which repeats. Results go to FOLDER (`every-command` by default), each
-command is printed before it runs, and all but refinement, tolerance, fine-tuning and pre-compensation, which are cut
-short, take their defaults. Seven minutes on two cores; a second call resumes what was stopped.
+command is printed before it runs, and all but refinement, the certificate, tolerance, the table, fine-tuning and
+pre-compensation, which are cut short, take their defaults. Seven minutes on two cores; a second call resumes what was
+stopped.
 """
 
 import argparse

@@ -5,7 +5,7 @@
 Without a run folder it first designs a small plate from examples/quick.toml (half a minute). Then it asks two questions
 about a mask aligner that misses by a quarter of a micrometre:
 
-1. What do a few dozen plates look like?     doedesign tolerance RUN --draws 24
+1. What do a few dozen plates look like?     doedesign tolerance RUN --draws 40
 2. Which mask must be aligned best?          doedesign tolerance RUN --sensitivity one_at_a_time
 
 The deepest etch should matter most: a misplaced edge of mask k leaves a strip that is wrong by 2^k level steps.

@@ -22,7 +22,8 @@ def report(
     """Write one HTML file with all that is known of a run: it opens from the disk, without a network.
 
     Maps to zoom to single pixels, PSFs by depth and colour, yield, the order as a model to turn, and where every number
-    comes from. Parts appear once their data exist: psf, masks, tolerance, simulate, train and evaluate add to it.
+    comes from. Parts appear once their data exist: psf, certify, masks, tolerance, calibrate, simulate, train and
+    evaluate add to it.
 
     Args:
         run: Run folder, finished or at work.
