@@ -200,8 +200,8 @@ class ProcessSpec(SpecTable, frozen=True):
             little off uncovers no blank glass. Light passes an opening of `doe.aperture` less twice this.
         stock: a process of `fab.stock.STOCK` that stands in for what is not given here.
         etches: the etches in the order in which they are done, each mask once; shallow to deep where none is given.
-        tone: what polygons are on photomasks: "clear" (dark field, for positive resist) or "dark" (clear field, for a
-            negative one).
+        tone: what polygons are on photomasks: "clear" (dark field, for positive resist), which it is unless said, or
+            "dark" (clear field, for a negative one).
         minimum_line_m: narrowest line the lithography prints.
         minimum_space_m: narrowest gap the lithography prints.
         die_m: where on the wafer the DOE lies (y, x).

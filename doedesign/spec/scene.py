@@ -138,10 +138,12 @@ class SensorSpec(SpecTable, frozen=True):
         quantum_efficiency: electrons per photon, one number or one per colour.
         read_noise_e: standard deviation of a reading, electrons.
         dark_e: mean number of electrons of dark current.
-        black_level: raw number of a pixel without electrons; a 64th of all raw numbers by default.
+        black_level: raw number of a pixel without electrons; by default a 64th of all raw numbers with "physical"
+            noise, 0 with another.
         bits: bits of a raw number.
         bayer: the four upper left photosites of a mosaic, row by row; every pixel sees every colour if left out.
-        noise: noise model.
+        noise: noise model (`sim.sensor`): "physical", which is that of electrons and the usual one, "tseng" or
+            "release", those of other codes, or "none".
     """
 
     angles: ClassVar = {"pixel_angle_rad": ANGLE}
