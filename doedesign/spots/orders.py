@@ -17,7 +17,7 @@ from fab.aperture import MaskAperture, RoundAperture
 from fab.grid import Grid
 from fab.units import MILLIMETRES, PlaceUnit
 from sim.camera import Camera
-from sim.illumination import EvenBeam
+from sim.illumination import Beam, EvenBeam
 from sim.metrics import opening
 from sim.optic import CellOptic
 from sim.propagation.directions import DirectionSum, peak_amplitudes
@@ -225,7 +225,7 @@ def order_table(
     away = camera.distance_m is not None and not camera.in_angles
     focal = {"distance_m": None, "focal_length_m": camera.distance_m} if away else {}
     bare = camera.beam is not None or away
-    plain = replace(optic, camera=replace(camera, beam=None, **focal)) if bare else optic
+    plain = replace(optic, camera=replace(camera, beam=_even_along(camera.beam), **focal)) if bare else optic
     field, coverage, grid = np.asarray(plain.field(line, np.inf)), np.asarray(optic.coverage), camera.grid
     # Of a beam that is wider than the opening the chrome takes its part, as it does from PSFs and areas.
     even = camera.beam is None or isinstance(camera.beam, EvenBeam)
@@ -256,6 +256,13 @@ def order_table(
         wave,
         bool(np.any(np.hypot(*(spots.waves_per_m * camera.opening.widest_m).T) < _AT_THE_ZEROTH)),
     )
+
+
+def _even_along(beam: Beam | None) -> EvenBeam | None:
+    """Plane light as bright everywhere from where a beam comes: oblique glass delays it more. None along the axis."""
+    if beam is None or not any((*beam.angle_rad, *beam.tilt_rad)):
+        return None
+    return EvenBeam(angle_rad=beam.angle_rad, tilt_rad=beam.tilt_rad)
 
 
 def _in_wave(
