@@ -54,6 +54,18 @@ def beam_picture(path: Path) -> np.ndarray:
     return grey
 
 
+@pytest.mark.parametrize("key", ["angle", "tilt"])
+def test_the_level_step_for_a_beam_aslant_is_that_of_oblique_glass(tmp_path: Path, key: str):
+    """One wave at 532 nm and 20 degrees: 532 nm / (sqrt(n² - sin²) - cos), n = 1.46071, is 1107.4 nm."""
+    aslant = f"illumination.{key}=['20 deg', '0 deg']"
+    (warning,) = [w for w in spec_warnings(spec_of(tmp_path, PLANE, aslant)) if w.startswith("process.level_step")]
+    assert "is passed by the beam 20 degrees off the axis" in warning
+    assert "+4.0 % off" in warning
+    assert 'A level_step of "138.42 nm" would.' in warning
+    good = spec_of(tmp_path, PLANE, aslant, "process.level_step=138.4 nm")
+    assert not [w for w in spec_warnings(good) if w.startswith("process.level_step")]
+
+
 def test_a_spec_has_x_before_y_and_a_beam_y_before_x(tmp_path: Path):
     given = ("illumination.m_squared=[1.5, 1.0]", "illumination.angle=['0 deg', '1 deg']")
     more = ("illumination.centre=['5 um', '0 um']", 'illumination.waist_distance="-0.2 m"')
