@@ -19,7 +19,7 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 def spec_warnings(spec: Spec) -> list[str]:
     """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
     rules = (_level_warning, _printing_warning, _window_warnings, _pixel_warning, _occlusion_warning, _limit_warnings)
-    rules = (*rules, _mask_warning, _walls_warning)
+    rules = (*rules, _mask_warning, _walls_warning, _colour_warning)
     return [warning for rule in rules for warning in rule(spec)]
 
 
@@ -40,6 +40,20 @@ def _walls_warning(spec: Spec) -> Iterator[str]:
         yield (
             f'optics.light: the light of walls that "edges" adds is not in the search of {searched[0]}, which gives '
             "the same design without it; the finished plate is judged with edges."
+        )
+
+
+def _colour_warning(spec: Spec) -> Iterator[str]:
+    """Warn that spots and areas without a colour are for the first wavelength, where that is not the design one."""
+    wavelengths = [wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m]
+    listed = any(math.isclose(each, spec.optics.design_wavelength_m, rel_tol=1e-6) for each in wavelengths[1:])
+    own = "spots" if spec.spots else "area" if any(area.colour is None for area in spec.areas) else ""
+    if own and listed and not math.isclose(wavelengths[0], spec.optics.design_wavelength_m, rel_tol=1e-6):
+        design, first = (format_length(each) for each in (spec.optics.design_wavelength_m, wavelengths[0]))
+        cure = "List it first" + (", or give every area its colour." if own == "area" else ".")
+        yield (
+            f"optics.wavelengths: [{own}] is designed and judged at {first}, the first of them, and not at the design "
+            f"wavelength of {design}. {cure}"
         )
 
 

@@ -478,6 +478,22 @@ def test_doubts_are_said(overrides: list[str], part: str):
     assert any(part in warning for warning in spec_warnings(load_spec(AUTOMOTIVE, overrides)))
 
 
+@pytest.mark.parametrize(("template", "own"), [("splitter", "spots"), ("diffuser", "area")])
+def test_a_target_that_is_not_for_the_design_wavelength_is_told(tmp_path: Path, template: str, own: str):
+    path = tmp_path / "spec.toml"
+    path.write_text(template_text(template))
+
+    def told(*nanometres: int) -> list[str]:
+        listed = ", ".join(f'"{each} nm"' for each in nanometres)
+        return [w for w in spec_warnings(load_spec(path, [f"optics.wavelengths=[{listed}]"])) if "judged at" in w]
+
+    assert not told(532)
+    assert not told(532, 633)
+    (warning,) = told(633, 532)
+    assert f"[{own}] is designed and judged at 633 nm" in warning
+    assert "not at the design wavelength of 532 nm. List it first" in warning
+
+
 @pytest.mark.parametrize(
     ("template", "what"), [("splitter", "spots"), ("fan_out", "spots"), ("diffuser", "areas"), ("bifocal", "foci")]
 )

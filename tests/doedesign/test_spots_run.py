@@ -287,6 +287,16 @@ def test_spots_beyond_what_cells_steer_are_told_the_pitch_that_would_do(free: Pa
         load_spec(free, ["spots.spacing=4 mm"])
 
 
+def test_spots_too_far_from_a_tilted_beam_are_told_from_where_it_goes(free: Path):
+    """The beam goes 20 mm x sin(20 degrees) = 6.84 mm aside, and the outer spots lie 0.12 mm on the other side."""
+    tilted = ['illumination={ kind = "plane", tilt = ["20 deg", "0 deg"] }']
+    with pytest.raises(InputError) as refused:
+        load_spec(free, tilted)
+    told = str(refused.value)
+    assert "steer light 2660 um far at most, but got a spot 6960 um from where the tilted beam goes" in told
+    assert "choose a pitch of at most 764 nm." in told  # 532 nm / 2 / 0.34802, rounded down
+
+
 @pytest.mark.parametrize(
     ("overrides", "key", "words"),
     [

@@ -15,7 +15,7 @@ from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.aperture import MaskAperture, RoundAperture
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.units import MICROMETRES, MM, UM, format_length
+from fab.units import MICROMETRES, MM, NM, UM, format_length
 from sim.illumination import GaussianBeam
 from sim.lens import sines_at
 
@@ -108,6 +108,7 @@ class SpotsSpec(SpecTable, frozen=True):
 _PLACING = ("count", "rings", "number", "spacing_m", "radius_m", "places_m", "period_m")
 _FEWEST_CELLS = 4  # of a unit cell
 MOST_CELLS = 2**16  # of a unit cell whose cells are exchanged one by one
+_BEAM = "where the tilted beam goes straight on"
 ONE_OF_THE_SPOTS = "one of the spots"  # said of a 0th order that is wanted
 # Distance of spots in spot widths, wavelength / aperture in direction sine. The efficiency of a spot is the light in
 # the plane wave that goes there, and two such waves share light on the aperture: sinc² of their distance if it is
@@ -204,11 +205,13 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
             farthest, sine = max(abs(y), abs(x)), max(map(abs, sines))
     if sine > most:
         unit = spec.told_in(MICROMETRES)
+        # Of a tilted beam, light goes as far from where the beam itself goes.
+        axis, farthest = ("the axis", farthest) if not any(spec.moved_sines) else (_BEAM, sine * spec.image_distance_m)
         end, got = (f"{unit.of(at):.4g} {unit.suffix}" for at in (most * spec.image_distance_m, farthest))
         rule = f"cells of {format_length(pitch)} steer light {end} far at most"
-        finer = format_length(wavelength / (2 * sine))
-        cure = f"Bring the spots nearer to the axis, or choose a pitch of at most {finer}."
-        yield InputError("spots", rule, f"a spot {got} from the axis", cure)
+        finer = format_length(math.floor(wavelength / (2 * sine) / NM) * NM)  # rounded up it would be too coarse
+        cure = f"Bring the spots nearer to {axis}, or choose a pitch of at most {finer}."
+        yield InputError("spots", rule, f"a spot {got} from {axis}", cure)
 
 
 def _whole_period(spec: "Spec") -> Iterator[InputError]:
