@@ -30,6 +30,8 @@ _ROWS = 256
 _SAME = 1e-9
 # Far beyond what is made, so that sums of depths stay numbers.
 _LONGEST_M = 1e3
+# A map that reaches so high is not in metres: no staircase is so deep.
+_UNLIKELY_M = 1e-4
 # Heights of two levels must differ by this part of a step. No process tells less apart, and single precision keeps a
 # height to 1e-5 of a step, so that a stored height always says which level it is.
 _APART = 1e-3
@@ -171,13 +173,16 @@ def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8
     """
     require_heights(height_m, "height map")
     top = (levels.count - 0.5) * levels.step_m if levels.is_binary else levels.total_m + 0.5 * levels.step_m
+    cure = "Wrap the map to one wave of height, or choose more levels or a larger step."
+    if height_m.max() >= _UNLIKELY_M:
+        cure = 'Heights are taken as metres; of a map in other units give the scale, such as "1 nm".'
     # One part in 1e6 of a step keeps a float32 height that means exactly half a step above the top.
     refuse_where(
         height_m,
         height_m > top + 1e-6 * levels.step_m,
         "height map",
         f"no height may lie more than half a step above the top level ({format_length(top)} for {levels})",
-        "Wrap the map to one wave of height, or choose more levels or a larger step.",
+        cure,
     )
     order, heights = levels.by_height()
     halfway = (heights[1:] + heights[:-1]) / 2

@@ -32,6 +32,7 @@ from sim.threads import at_once
 _SIDE = 16  # directions per axis, one in each part of the window
 _PARTS = 8  # of a cell on the rim, per axis
 _SEED = 0
+_LEAST_TOLD = 0.01  # per cent; what is less is of no account, and its digits would be powers of ten
 _OTHER: dict[str, Mapping] = {"sine": "tangent", "tangent": "sine"}
 
 
@@ -131,7 +132,10 @@ def in_words(found: Sequence[Accuracy], camera: Camera) -> str:
     """The largest of every cause, on one line."""
 
     def largest(values: list[float]) -> str:
-        return f"{100 * max(values):.2g} %"
+        percent = 100 * max(values)
+        if percent < _LEAST_TOLD:
+            return f"below {_LEAST_TOLD:g} %"
+        return f"{float(f'{percent:.2g}'):g} %"
 
     parts = []
     if numerics := [one.numerics for one in found if one.numerics is not None]:

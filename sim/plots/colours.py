@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from fab.figure import LINE, SERIES, evenly_spaced, length_text
+from fab.units import NM
 from sim.camera import Colour
 from sim.metrics import mean_wavelength_m
 
@@ -13,8 +14,8 @@ _BLUE, _RED, _GREEN = SERIES[:3]
 def colour_label(colour: Colour) -> str:
     """Name and wavelength of a colour channel: "red, 656 nm"; only the wavelength where the name says no more."""
     mean = "mean " if len(colour.wavelengths_m) > 1 else ""
-    wavelength = length_text(mean_wavelength_m(colour))
-    same = colour.name == wavelength.replace(" ", "").replace(".", "p")
+    middle_m = mean_wavelength_m(colour)
+    wavelength, same = length_text(middle_m), colour.name == f"{middle_m / NM:.6g}nm".replace(".", "p")
     return wavelength if same else f"{colour.name}, {mean}{wavelength}"
 
 

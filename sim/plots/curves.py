@@ -178,8 +178,7 @@ def _plot_curves(
         grid[0, 0].set_ylim(0, 1.02)
         keys = [Line2D([], [], color=hues[i], label=colour_label(camera.colours[i])) for i in _shown(camera)]
         if len(both) > 1:
-            keys.append(
-                Line2D([], [], color=INK, **_LENS, label="aperture alone" if camera.in_angles else "lens alone")
-            )
+            alone = "lens alone" if camera.distance_m is None else "aperture alone"
+            keys.append(Line2D([], [], color=INK, **_LENS, label=alone))
         legend_above(figure, keys, title)
     return figure

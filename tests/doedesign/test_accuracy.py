@@ -86,3 +86,9 @@ def test_words_name_the_largest():
     slit = replace(camera(8), aperture=RectangularAperture((4e-6, 8e-6)), mapping="tangent")
     other = "lens mapping (tangent, not sine) 8 %"
     assert in_words(found, slit) == f"{head} the rim 0.12 %, light of walls left out 4.3 %, {other}"
+
+
+def test_small_and_large_errors_are_told_without_powers_of_ten():
+    said = in_words([Accuracy("g", np.inf, 0.0018, 6.1e-7, 0.011, 1.28)], camera(8))
+    assert "numerics 0.18 %, square cells on the round rim below 0.01 %, light of walls left out 1.1 %" in said
+    assert said.endswith("lens mapping (sine, not tangent) 130 %")

@@ -129,6 +129,11 @@ def test_a_folder_is_no_height_map(tmp_path: Path):
 
 
 def test_messages_name_the_file(tmp_path: Path):
-    np.save(tmp_path / "high.npy", np.full((4, 4), 1e-3))
+    np.save(tmp_path / "nanometres.npy", np.full((4, 4), 700.0))
+    with pytest.raises(InputError, match=r"Heights are taken as metres.*scale, such as \"1 nm\""):
+        drawing_from(tmp_path / "nanometres.npy", 16, step_m=STEP_M, pitch_m=1e-6)
+    np.save(tmp_path / "high.npy", np.full((4, 4), 2e-6))
+    with pytest.raises(InputError, match="Wrap the map to one wave of height"):
+        drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)
     with pytest.raises(InputError, match=r"high\.npy: no height may lie more than half a step above"):
         drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)

@@ -1,6 +1,7 @@
 """Pictures of light are looked at by people; machines check that they are whole, the right way up and honest."""
 
 import dataclasses
+import math
 import os
 import re
 from functools import partial
@@ -219,9 +220,19 @@ def test_shares_of_the_light_are_told_for_each_colour_alone():
     assert all(words)
 
 
+def test_without_a_lens_the_aperture_is_compared_with(rng: np.random.Generator):
+    """A plate alone before a sensor has no lens beside which it could be drawn."""
+    bare = dataclasses.replace(CAMERA, focal_length_m=math.inf, distance_m=20e-3)
+    for camera, label in ((CAMERA, "lens alone"), (bare, "aperture alone")):
+        drawn: Any = plot_encircled(random_bank(rng), camera, NEAR, FAR, random_bank(rng))
+        told = [text.get_text() for legend in drawn.legends for text in legend.get_texts()]
+        assert told[-1] == label
+
+
 def test_labels():
     assert colour_label(RGB[0]) == "656 nm"
     assert colour_label(Colour("532p5nm", (532.5e-9,), (1.0,))) == "532.5 nm"
+    assert colour_label(Colour("1064nm", (1064e-9,), (1.0,))) == "1.064 µm"
     assert colour_label(Colour("green", (500e-9, 540e-9), (0.5, 0.5))) == "green, mean 520 nm"
     assert line_colours(RGB) == line_colours(RGB[::-1])[::-1]  # by wavelength, not by place
     assert depth_positions((0.05, np.inf), (np.inf, 0.05 * (1 + 1e-8)), 3) == [1, 0]
