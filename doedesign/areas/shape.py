@@ -162,6 +162,16 @@ class AreaTable:
         """Numbers that a tolerance study follows."""
         return {"on_target": self.efficiency, "contrast": self.contrast}
 
+    @property
+    def zeroth_order_note(self) -> str:
+        """Words after the 0th order where light goes straight on into the area, whose own light there is part of it."""
+        at = []
+        for axis, sine in zip((self.target.sines_y, self.target.sines_x), self.camera.moved_sines(), strict=True):
+            if not axis[0] <= sine <= axis[-1]:
+                return ""
+            at.append(int(np.abs(axis - sine).argmin()))
+        return " (within the area)" if self.target.lit[at[0], at[1]] else ""
+
     def describe(self) -> str:
         """One line."""
         size = ""
@@ -174,7 +184,8 @@ class AreaTable:
         return (
             f"{self.target.shape}: {100 * self.efficiency:.2f} % of the light (ceiling: none known), contrast "
             f"{100 * self.contrast:.2f} %{pixels}{size}{wave}, "
-            f"0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of {100 * (1 - self.fresnel):.1f} % apart"
+            f"0th order {100 * self.zeroth_order:.3f} %{self.zeroth_order_note}; "
+            f"Fresnel loss of {100 * (1 - self.fresnel):.1f} % apart"
         )
 
     def to_csv(self) -> str:

@@ -38,7 +38,8 @@ def plot_areas(tables: "Sequence[AreaTable]", ax: "Axes | None" = None) -> "Figu
 
 def plot_area(table: "AreaTable", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the light of an area over that of its flat part, and its profiles beside the wanted ones."""
-    note = f"{_NOTE.format(100 * (1 - table.fresnel))} 0th order {100 * table.zeroth_order:.2g} %."
+    zeroth = f"0th order {100 * table.zeroth_order:.2g} %{table.zeroth_order_note}."
+    note = f"{_NOTE.format(100 * (1 - table.fresnel))} {zeroth}"
     note += f" {table.wave}." if table.wave else ""
     with panels(ax, (5.2 if table.along_x is None else 8.6, 4.2), _title(table), note) as figure:
         _draw(table, figure)

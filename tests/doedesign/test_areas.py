@@ -340,6 +340,26 @@ def test_other_shapes_get_most_of_the_light(tmp_path: Path, changes: list[str], 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "inside"),
+    [
+        ([], True),
+        (["area.offset=['200 um', '0 um']"], False),  # the area begins 50 um from the axis
+        (["area={ shape = 'ring', width = '300 um', inner = '150 um' }"], False),
+        # The beam goes 20 mm x sin(0.5 deg) = 175 um aside, beyond the area, and with the area there into it again.
+        (["illumination={ kind = 'plane', tilt = ['0.5 deg', '0 deg'] }"], False),
+        (["illumination={ kind = 'plane', tilt = ['0.5 deg', '0 deg'] }", "area.offset=['150 um', '0 um']"], True),
+    ],
+)
+def test_a_0th_order_within_the_area_is_told_as_that(tmp_path: Path, changes: list[str], inside: bool):
+    spec = spec_of(tmp_path, *changes)
+    camera = camera_from_spec(spec)
+    table = area_table(HeightOptic.of(camera), AreaTarget.of(spec.areas[0], camera))
+    assert table.zeroth_order == pytest.approx(1, abs=1e-6)  # flat glass
+    note = " (within the area)" if inside else ""
+    assert f"0th order 100.000 %{note}; Fresnel" in table.describe()
+
+
 def test_a_picture_is_drawn_upright(tmp_path: Path):
     grey = np.zeros((40, 60), np.uint8)
     grey[25:35, 10:50] = 255  # a bar in the upper half
