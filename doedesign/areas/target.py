@@ -148,7 +148,8 @@ class AreaTarget:
             turned = np.zeros(value.shape) if phase is None else _draw_phase(phase, at, size_m)
         target = cls(sines_y, sines_x, value, dark, middle, size_m, edge, table.shape, (rows, columns), turned)
         if not target.flat.any():
-            sizes = edge, _LEAST * edge, min(filter(None, size_m))
+            band_m = None if table.inner_m is None else (min(size_m) - table.inner_m) / 2  # of a ring
+            sizes = edge, _LEAST * edge, min(filter(None, (*size_m, band_m)))
             falls, least, got = (_size_text(camera, size) for size in sizes)
             rule = f"light falls over {falls} there, so that an area needs {least}"
             raise InputError("area", rule, got, "Choose a larger area, a larger aperture, or a nearer sensor.")

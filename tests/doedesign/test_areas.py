@@ -675,3 +675,10 @@ def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
     path = tmp_path / "again.toml"
     path.write_text(spec_to_toml(spec))
     assert load_spec(path) == spec
+
+
+def test_a_ring_too_narrow_is_told_the_width_of_its_band(tmp_path: Path):
+    ring = "area={ shape = 'ring', width = '300 um', inner = '200 um' }"
+    spec = spec_of(tmp_path, ring)
+    with pytest.raises(InputError, match=r"an area needs 63\.6 um, but got 50 um"):
+        AreaTarget.of(spec.areas[0], camera_from_spec(spec))
