@@ -17,6 +17,7 @@ import optax
 import pytest
 from PIL import Image
 
+import doedesign.evaluation.rivals.files
 import doedesign.training.job
 from doedesign.capture.images import sample_files
 from doedesign.design.design import Design
@@ -450,7 +451,8 @@ class OneLayerInHoles(OneLayer):
 
 
 def least(monkeypatch: pytest.MonkeyPatch, like: str) -> Rival:
-    """The least rival in the place of another."""
+    """The least rival in the place of another; it has fewer weights than a file of any other."""
+    monkeypatch.setattr(doedesign.evaluation.rivals.files, "_LEAST_WEIGHTS", 1)
     rival = replace(RIVALS[like], make=(OneLayerInHoles if like in FILLS_HOLES else OneLayer).make)
     monkeypatch.setitem(RIVALS, like, rival)  # pyright: ignore[reportArgumentType]
     return rival

@@ -32,7 +32,7 @@ def overrides(*pairs):
         # Lengths with more digits than the manifest of an order keeps.
         ["doe.pitch=1.8333333333333333 um", "doe.aperture=117.3333 um", "process.level_step=74.123456789123 nm"],
         ["scene.near=[]", 'scene.far=["inf"]', 'objective=[{name="far_spot"}]'],
-        ['scene.near=["6 mm", "6 mm"]'],
+        ['scene.near=["6 mm", "6.0001 mm"]'],
         ['optics.wavelengths=["656 nm", "486 nm"]', "sensor.defocus=5 um", "sensor.fill_factor=0.8"],
     ],
     ids=" ".join,
