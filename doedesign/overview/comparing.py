@@ -160,7 +160,9 @@ def _keys_of(text: str) -> dict[str, str]:
 
 
 def difference_text(number: ComparedNumber, position: int) -> str:
-    """The difference of one folder from the first in words, with its sign; nothing where it is not known.
+    """The difference of one folder from the first in words, with its sign; nothing where it is not known, or too small.
+
+    That of percentages is in points.
 
     Args:
         number: the compared number.
@@ -169,5 +171,8 @@ def difference_text(number: ComparedNumber, position: int) -> str:
     difference = number.differences[position]
     if position == 0 or difference is None:
         return ""
-    sign = "+" if difference >= 0 else "-"
-    return f"{sign}{number_text(abs(difference), number.unit)}"
+    sign, text = "+" if difference >= 0 else "-", number_text(abs(difference), number.unit)
+    if text.startswith("below"):
+        return ""
+    # Of shares, "+5 %" could be one of 25 to 30 % or of 25 to 26.25 %.
+    return f"{sign}{text.replace(' %', ' points')}"

@@ -19,6 +19,7 @@ COUNT = "count"
 
 _GROUPED = 10_000  # counts from here on have their digits in groups of three
 _SMALL_PERCENT = 0.995  # which one decimal would round away
+_LEAST_PERCENT = 1e-4
 
 
 class MainNumber(NamedTuple):
@@ -53,7 +54,7 @@ class MainNumber(NamedTuple):
 
 
 def number_text(value: float, unit: str = "") -> str:
-    """A number as the tables of this program write it; a percentage below 1 has two significant digits.
+    """A number as the tables of this program write it; a percentage below 1 has two significant digits, down to 0.0001.
 
     Args:
         value: the number.
@@ -61,6 +62,8 @@ def number_text(value: float, unit: str = "") -> str:
     """
     if unit == COUNT:
         return f"{value:,.0f}".replace(",", " ") if abs(value) >= _GROUPED else f"{value:.0f}"
+    if unit == "%" and 0 < abs(value) < _LEAST_PERCENT:
+        return f"below {_LEAST_PERCENT:.4f} %"
     if unit == "%" and 0 < abs(value) < _SMALL_PERCENT:
         return f"{value:.2g} %"
     digits = {"%": 1, "dB": 2}.get(unit, 3)

@@ -253,7 +253,7 @@ def test_two_runs_side_by_side(tmp_path: Path):
     code, out, _ = call("compare", first, second)
     assert code == 0
     row = next(line.split("\t") for line in out.splitlines() if line.startswith("far spot"))
-    assert row == ["far spot", "25.0 %", "30.0 % (+5.0 %) *"]
+    assert row == ["far spot", "25.0 %", "30.0 % (+5.0 points) *"]
     assert json.loads(call("compare", first, second, "--json")[1])["spec"][0]["key"] == "process.level_step"
 
 
@@ -371,6 +371,8 @@ def test_broken_rules_are_counted_in_places(tmp_path: Path):
     ("value", "text"),
     [
         (0.0, "0.0 %"),
+        (1.9e-11, "below 0.0001 %"),
+        (0.00013, "0.00013 %"),
         (0.0203, "0.02 %"),
         (0.1234, "0.12 %"),
         (-0.5, "-0.5 %"),
