@@ -75,7 +75,7 @@ class Camera:
     Attributes:
         grid: cells of the DOE.
         aperture: the clear aperture (`fab.aperture`); a number is the diameter of a round one, metres.
-        material: substrate, a key of `sim.material.MATERIALS`.
+        material: substrate, a name that `sim.material.material` takes.
         colours: colour channels, in the order of the bank's first axis.
         focal_length_m: focal length of the lens.
         pixel_m: centre-to-centre distance of sensor pixels, after binning.

@@ -1,9 +1,12 @@
 """Refractive indices of DOE substrates and resists, and what their faces reflect.
 
 Every entry is a dispersion formula with its published coefficients, range and citation. A wavelength
-outside the range is refused, never extrapolated.
+outside the range is refused, never extrapolated. For other materials an index of one's own, the same at every
+wavelength, stands in place of a name: "n=1.52".
 """
 
+import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -96,15 +99,65 @@ MATERIALS: dict[str, Material] = {
             ((1.566, 0), (0.00796, -2), (0.00014, -4)),
             "MicroChem SU-8 2000 data sheet (2011), uncured film",
         ),
+        Material(
+            "calcium_fluoride",
+            "calcium fluoride",
+            (0.23e-6, 9.7e-6),
+            _sellmeier,
+            ((0.5675888, 0.050263605**2), (0.4710914, 0.1003909**2), (3.8484723, 34.649040**2)),
+            "I. H. Malitson, Appl. Opt. 2, 1103 (1963)",
+        ),
+        Material(
+            "zinc_selenide",
+            "zinc selenide",
+            (0.54e-6, 18.2e-6),
+            _sellmeier,
+            ((4.45813734, 0.200859853**2), (0.467216334, 0.391371166**2), (2.89566290, 47.1362108**2)),
+            "B. Tatian, Appl. Opt. 23, 4477 (1984), of data by J. Connolly et al., Proc. SPIE 181, 141 (1979)",
+        ),
+        Material(
+            "silicon",
+            "silicon",
+            (1.36e-6, 11e-6),
+            _sellmeier,
+            ((10.6684293, 0.301516485**2), (0.0030434748, 1.13475115**2), (1.54133408, 1104.0**2)),
+            "C. D. Salzberg, J. J. Villa, J. Opt. Soc. Am. 47, 244 (1957); formula: B. Tatian (1984)",
+        ),
+        Material(
+            "germanium",
+            "germanium",
+            (2.5e-6, 12e-6),
+            _sellmeier,
+            ((8.28156, 0.0), (6.72880, 0.44105), (0.21307, 3870.1)),
+            "N. P. Barnes, M. S. Piltch, J. Opt. Soc. Am. 69, 178 (1979)",
+        ),
     )
 }
+_OWN_INDEX = re.compile(r"n=(\d\.\d+|\d)")
+_LEAST_INDEX, _MOST_INDEX = 1.05, 6.0  # of a substrate
 
 
 def material(name: str) -> Material:
-    """The material of that name, or an InputError that lists those there are."""
-    if name not in MATERIALS:
-        raise InputError("material", f"must be one of {', '.join(MATERIALS)}", repr(name), "Pick one of these names.")
-    return MATERIALS[name]
+    """The material of that name, or that of an index of one's own ("n=1.52"), the same at every wavelength.
+
+    Raises:
+        InputError: neither; it lists the names that there are.
+    """
+    if name in MATERIALS:
+        return MATERIALS[name]
+    if (own := _OWN_INDEX.fullmatch(name)) and _LEAST_INDEX <= (index := float(own[1])) <= _MOST_INDEX:
+        return Material(name, f"a material of index {index:g}", (0.0, math.inf), _cauchy, ((index, 0),), "")
+    rule = f"must be one of {', '.join(MATERIALS)}, or an index from {_LEAST_INDEX:g} to {_MOST_INDEX:g} as n=1.52"
+    raise InputError("material", rule, repr(name), "Pick one of these names, or give the index.")
+
+
+def is_material(name: str) -> bool:
+    """Whether `material` takes a name."""
+    try:
+        material(name)
+    except InputError:
+        return False
+    return True
 
 
 def refractive_index(name: str, wavelength_m: float) -> float:
@@ -134,6 +187,8 @@ def full_wave_wavelength_m(name: str, height_m: float) -> float:
     from scipy.optimize import brentq
 
     low, high = material(name).range_m
+    if math.isinf(high):  # an index that no wavelength changes
+        return height_m * (material(name).index(1.0) - 1.0)
 
     def excess(wavelength_m: float) -> float:
         return full_wave_height_m(name, wavelength_m) - height_m

@@ -47,7 +47,6 @@ from doedesign.spec.values import (
     broken,
     from_toml,
     is_start,
-    known,
     length,
     share,
 )
@@ -57,12 +56,13 @@ from doedesign.spec.wafer import WaferSpec
 from fab.aperture import Aperture, aperture_from
 from fab.units import DEGREES, MM, NM, UM, PlaceUnit, parse_length
 from sim.camera import Light, Polarised
-from sim.material import MATERIALS
+from sim.material import MATERIALS, is_material
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 Wavelength = Annotated[float, length(200 * NM, 20 * UM)]
+Substrate = Annotated[str, accepted(is_material, "must be a known material, or an index as n=1.52", MATERIALS)]
 Distortion = Annotated[float, share(-10.0, 10.0)]
 SpecName = Annotated[
     str, accepted(_FILE_NAME.fullmatch, "must be a file name of at most 64 letters, digits, dots, dashes")
@@ -179,13 +179,14 @@ class DoeSpec(SpecTable, frozen=True):
             pitch; as many per side its longer side. Or a picture (.png, .tif, .npy) beside the spec, "mask.png", whose
             white is the relief: it covers the cells, up in it is +y, and row 0 of an array is the lowest y. The spec
             keeps the open cells (`doedesign.spec.values.aperture`).
-        material: substrate, a key of `sim.material.MATERIALS`.
+        material: substrate, a key of `sim.material.MATERIALS`; of others the refractive index, the same at every
+            wavelength: "n=1.52".
     """
 
     samples: Samples = Field(examples=["2400"])
     pitch_m: Pitch = Field(examples=['"1.85 um"'])
     aperture_m: ApertureSizes = Field(examples=['"4.44 mm"'])
-    material: Annotated[str, known("material", MATERIALS)] = Field(examples=['"fused_silica"'])
+    material: Substrate = Field(examples=['"fused_silica"'])
 
     @field_validator("aperture_m")
     @classmethod

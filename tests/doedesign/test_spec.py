@@ -140,6 +140,12 @@ def test_toml_keeps_every_digit_of_a_length(pitch_m: float, focal_m: float, tmp_
     assert load_spec(path) == spec
 
 
+def test_an_index_of_ones_own_is_a_material():
+    spec = load_spec(AUTOMOTIVE, ["doe.material=n=1.46"])
+    assert camera_from_spec(spec).waves_per_metre(550e-9) == pytest.approx(0.46 / 550e-9, rel=1e-12)
+    assert spec_from_json(spec_to_json(spec), "test") == spec
+
+
 def test_infinite_depth_survives_json():
     spec = load_spec(AUTOMOTIVE, ['scene.far=["5 m", "inf"]'])
     assert spec.scene.far_m == (5.0, math.inf)
