@@ -36,6 +36,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import doedesign.recon.blocks as blocks
 import doedesign.recon.network as layers
 from bench.capture import make_psf, verdict
 from bench.psf import high_water_mb
@@ -137,18 +138,24 @@ def network_floor(network: Network, size: int, window: int) -> tuple[list[Call],
     """Bare transforms of the Wiener filters, and bare convolutions: those that the network is seen to ask for."""
     seen: dict[str, list[tuple[Any, ...]]] = {}
 
-    def watched(name: str) -> Any:
-        original, calls = getattr(layers, name), seen.setdefault(name, [])
+    def watched(name: str, where: Any = layers) -> Any:
+        original, calls = getattr(where, name), seen.setdefault(name, [])
 
         def call(*given: Any, **more: Any) -> Any:
             calls.append((*(getattr(each, "shape", each) for each in given), more.get("unit", True)))
             return original(*given, **more)
 
-        return mock.patch.object(layers, name, call)
+        return mock.patch.object(where, name, call)
 
     colours = network.layout.colours
     shapes = [jax.ShapeDtypeStruct((1, colours, n, n), jnp.float32) for n in (size, window, window)]
-    with watched("convolution"), watched("doubled"), watched("deblurred"), watched("blur_at"), watched("sharpened"):
+    with (
+        watched("convolution", blocks),
+        watched("doubled"),
+        watched("deblurred"),
+        watched("blur_at"),
+        watched("sharpened"),
+    ):
         jax.eval_shape(network, *shapes)
     filters = []
     for (_, side, _, channels), *_ in seen["deblurred"]:
