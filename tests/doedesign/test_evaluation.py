@@ -153,9 +153,9 @@ def test_obstructions_of_a_single_distance_are_none_of_those_of_a_training(run: 
         kind, far = judged.kind, (min(judged.far_m), max(judged.far_m))
         trained = SceneData(Pictures(judged.files), kind, judged._view, far, judged.seed)
         for number in range(4):
-            masks = [data(number).scene.obstructions[0].mask for data in (judged.scene, trained.item)]
-            # Of 65 x 65 pixels with few clumps: those of other seeds correlate by 0.3 at most.
-            assert abs(np.corrcoef(*(np.ravel(mask) for mask in masks))[0, 1]) < 0.4
+            one, other = (data(number).scene.obstructions[0].mask for data in (judged.scene, trained.item))
+            # Of 65 x 65 pixels with few clumps: those of other seeds correlate by 0.2 at most here.
+            assert abs(np.corrcoef(np.ravel(one), np.ravel(other))[0, 1]) < 0.4
 
 
 def test_depths_are_those_whose_psfs_are_known(pairs: PairSet):

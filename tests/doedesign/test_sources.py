@@ -1,15 +1,14 @@
 """Which depths a step of the optimisation looks at, and where the image lies."""
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
 
-from doedesign.design.problem import SourceSet
+from doedesign.design.problem import SeenSource, SourceSet
 
 # Two lines, three near depths and two far ones; a number stands for the waves of each.
-NEAR: Any = tuple(tuple(np.float32(10 * line + depth) for depth in range(3)) for line in range(2))
-FAR: Any = tuple(tuple(np.float32(100 + 10 * line + depth) for depth in range(2)) for line in range(2))
+NEAR = tuple(tuple(SeenSource(np.float32(10 * line + depth)) for depth in range(3)) for line in range(2))
+FAR = tuple(tuple(SeenSource(np.float32(100 + 10 * line + depth)) for depth in range(2)) for line in range(2))
 LENS = np.arange(6, dtype=np.float32).reshape(2, 3)
 DISC_RADIUS_M = np.array([3e-4, 2e-4, 1e-4], np.float32)
 SOURCES = SourceSet(NEAR, FAR, LENS, DISC_RADIUS_M, 1e-6)
@@ -17,8 +16,8 @@ SOURCES = SourceSet(NEAR, FAR, LENS, DISC_RADIUS_M, 1e-6)
 
 def test_the_first_look_is_at_the_first_depths_on_the_axis():
     found = SOURCES.first_look()
-    assert found.near == ((0.0,), (10.0,))
-    assert found.far == ((100.0,), (110.0,))
+    assert found.near == ((SeenSource(0.0),), (SeenSource(10.0),))
+    assert found.far == ((SeenSource(100.0),), (SeenSource(110.0),))
     assert np.asarray(found.lens).tolist() == [[0.0], [3.0]]
     assert np.asarray(found.disc_radius_m).tolist() == DISC_RADIUS_M[:1].tolist()
     assert found.offset_m is None
@@ -29,10 +28,10 @@ def test_every_depth_is_seen_equally_often_by_all_lines():
     assert set(Counter(look.near[0][0] for look in looks).values()) == {4}
     assert set(Counter(look.far[0][0] for look in looks).values()) == {6}
     for look in looks:
-        assert look.near[1][0] == look.near[0][0] + 10
-        assert look.far[1][0] == look.far[0][0] + 10
-        assert np.asarray(look.lens)[:, 0].tolist() == LENS[:, int(look.near[0][0])].tolist()
-        assert np.asarray(look.disc_radius_m).tolist() == [DISC_RADIUS_M[int(look.near[0][0])]]
+        assert look.near[1][0].wave == look.near[0][0].wave + 10
+        assert look.far[1][0].wave == look.far[0][0].wave + 10
+        assert np.asarray(look.lens)[:, 0].tolist() == LENS[:, int(look.near[0][0].wave)].tolist()
+        assert np.asarray(look.disc_radius_m).tolist() == [DISC_RADIUS_M[int(look.near[0][0].wave)]]
 
 
 def test_a_step_is_the_same_again_and_others_differ():
