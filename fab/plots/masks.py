@@ -11,7 +11,7 @@ import numpy as np
 from fab.aperture import Aperture, MaskAperture
 from fab.figure import CHROME, HEIGHTS, INK, MARK, panels, scale_bar, shrunk
 from fab.plots.maps import Window, box_mm, frame_window, outline_of, show_map, window_around
-from fab.units import MM, NM, UM
+from fab.units import MM, NM, UM, format_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,9 +48,8 @@ def plot_masks(
         style = {"cmap": LinearSegmentedColormap.from_list("etch", [_GLASS, _ETCHED]), "vmin": 0, "vmax": 1}
         panes = below.subplots(2, columns, squeeze=False)
         for bit, plane in enumerate(level_map.planes()):
-            share = 100 * np.count_nonzero(plane) / plane.size
-            etched = f"mask {bit + 1}: etches {levels.etch_depth_m(bit) / NM:.6g} nm"  # one unit for all of them
-            words = f"{etched}\nwhere blue, {share:.1f} % of the picture"
+            depth = format_length(levels.etch_depth_m(bit))
+            words = f"mask {bit + 1}: etches {depth}\nwhere blue, {100 * np.count_nonzero(plane) / plane.size:.1f} %"
             show_map(panes[0, bit], shrunk(plane, _MOST), grid, None, words, **style)
             show_map(panes[1, bit], plane[window], grid, window, f"mask {bit + 1}, window", **style)
         for spare in panes[:, levels.bits :].flat:
