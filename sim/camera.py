@@ -18,7 +18,7 @@ from fab.grid import Grid
 from fab.units import DEGREES, PlaceUnit, format_length
 from sim.illumination import Beam, EvenBeam, beam_amplitude, beam_irradiance
 from sim.lens import IDEAL, Distortion, Mapping, check_lens, direction_sines, distorted_place, image_place, sines_at
-from sim.material import fresnel_transmission, refractive_index
+from sim.material import fresnel_transmission, refractive_index, waves_per_metre
 
 _PARAXIAL = 0.02  # wave
 # Without a lens an image is that of the axis, moved, while an oblique chief ray adds less than so much of a wave of
@@ -345,14 +345,9 @@ class Camera:
         return fresnel_transmission(refractive_index(self.material, wavelength_m))
 
     def waves_per_metre(self, wavelength_m: float, field_rad: tuple[float, float] = (0.0, 0.0)) -> float:
-        """Waves of delay per metre of DOE height.
-
-        (n - 1) / lambda on axis (eq. 2); for an oblique chief ray of direction sine s,
-        (sqrt(n^2 - s^2) - sqrt(1 - s^2)) / lambda, the thin-element path difference.
-        """
+        """Waves of delay per metre of DOE height (eq. 2), along the chief ray (`sim.material.waves_per_metre`)."""
         square = float(np.sum(np.square(direction_sines(self.light_rad(field_rad)))))
-        index = refractive_index(self.material, wavelength_m)
-        return (np.sqrt(index**2 - square) - np.sqrt(1.0 - square)) / wavelength_m
+        return waves_per_metre(self.material, wavelength_m, square)
 
     def defocus_radius_m(self, depth_m: float) -> float:
         """Radius on the sensor of the geometric blur disc: R · |B/z + 1 - d/f|, or R f / z in the focal plane.

@@ -179,6 +179,21 @@ def full_wave_height_m(name: str, wavelength_m: float) -> float:
     return wavelength_m / (refractive_index(name, wavelength_m) - 1.0)
 
 
+def waves_per_metre(name: str, wavelength_m: float, square_sine: float = 0.0) -> float:
+    """Waves by which a metre of the material `name` delays light more than a metre of air does.
+
+    (n - 1) / lambda along the axis; for light whose direction sine is s, (sqrt(n^2 - s^2) - sqrt(1 - s^2)) / lambda,
+    the path difference of a thin element.
+
+    Args:
+        name: the material.
+        wavelength_m: vacuum wavelength, metres.
+        square_sine: s^2.
+    """
+    index = refractive_index(name, wavelength_m)
+    return (np.sqrt(index**2 - square_sine) - np.sqrt(1.0 - square_sine)) / wavelength_m
+
+
 def full_wave_wavelength_m(name: str, height_m: float) -> float:
     """The wavelength, metres, that `height_m` of the material delays by exactly one wave: lambda = (n(lambda) - 1) h.
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from doedesign.overview.kinds import record_of
 from doedesign.overview.listing import require_whole
-from doedesign.overview.numbers import MainNumber, main_numbers, number_text
+from doedesign.overview.numbers import LEAST_PERCENT, MainNumber, main_numbers, number_text
 from doedesign.runs.costs import Cost, costs_of, together
 from doedesign.spec import load_spec, spec_to_toml
 from fab.errors import InputError
@@ -169,10 +169,8 @@ def difference_text(number: ComparedNumber, position: int) -> str:
         position: of the folder.
     """
     difference = number.differences[position]
-    if position == 0 or difference is None:
+    if position == 0 or difference is None or (number.unit == "%" and 0 < abs(difference) < LEAST_PERCENT):
         return ""
     sign, text = "+" if difference >= 0 else "-", number_text(abs(difference), number.unit)
-    if text.startswith("below"):
-        return ""
     # Of shares, "+5 %" could be one of 25 to 30 % or of 25 to 26.25 %.
     return f"{sign}{text.replace(' %', ' points')}"

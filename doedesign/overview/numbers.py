@@ -19,7 +19,7 @@ COUNT = "count"
 
 _GROUPED = 10_000  # counts from here on have their digits in groups of three
 _SMALL_PERCENT = 0.995  # which one decimal would round away
-_LEAST_PERCENT = 1e-4
+LEAST_PERCENT = 1e-4  # of which digits are told; those of less would be powers of ten
 
 
 class MainNumber(NamedTuple):
@@ -62,8 +62,8 @@ def number_text(value: float, unit: str = "") -> str:
     """
     if unit == COUNT:
         return f"{value:,.0f}".replace(",", " ") if abs(value) >= _GROUPED else f"{value:.0f}"
-    if unit == "%" and 0 < abs(value) < _LEAST_PERCENT:
-        return f"below {_LEAST_PERCENT:.4f} %"
+    if unit == "%" and 0 < abs(value) < LEAST_PERCENT:
+        return f"below {LEAST_PERCENT:.4f} %"
     if unit == "%" and 0 < abs(value) < _SMALL_PERCENT:
         return f"{value:.2g} %"
     digits = {"%": 1, "dB": 2}.get(unit, 3)

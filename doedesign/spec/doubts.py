@@ -9,7 +9,7 @@ from fab.aperture import MaskAperture
 from fab.errors import InputError
 from fab.units import DEGREES, MICROMETRES, NM, format_length
 from sim.lens import image_place
-from sim.material import full_wave_wavelength_m, refractive_index
+from sim.material import full_wave_wavelength_m, waves_per_metre
 
 _WAVE_TOLERANCE = 0.02
 _FINEST = 16  # pixels per wavelength / aperture
@@ -60,7 +60,8 @@ def _colour_warning(spec: Spec) -> Iterator[str]:
 def _level_warning(spec: Spec) -> Iterator[str]:
     process, material = spec.process, spec.doe.material
     height_m = process.levels * process.level_step_m
-    wave_m, aslant = _full_wave_m(spec), _beam_degrees(spec)
+    sine = _beam_sine(spec)
+    wave_m = 1 / float(waves_per_metre(material, spec.optics.design_wavelength_m, sine**2))
     waves = height_m / wave_m
     whole = max(1, round(waves))  # a relief of several waves parts colours
     if abs(waves / whole - 1) <= _WAVE_TOLERANCE or (waves < 1 and _nearly_flat(spec)):
@@ -69,8 +70,8 @@ def _level_warning(spec: Spec) -> Iterator[str]:
         exact = f"of {material} is one wave at {full_wave_wavelength_m(material, height_m) / NM:.0f} nm"
     except InputError:
         exact = f"is one wave at no wavelength {material} is known for"
-    if aslant:  # of another wavelength nothing is known to be one wave of oblique glass
-        exact = f"of {material} is passed by the beam {aslant:.3g} degrees off the axis"
+    if sine:  # of another wavelength nothing is known to be one wave of oblique glass
+        exact = f"of {material} is passed by the beam {math.degrees(math.asin(sine)):.3g} degrees off the axis"
     yield (
         f"process.level_step: {process.levels} x {format_length(process.level_step_m)} = {rounded(height_m)} {exact}; "
         f"at the design wavelength of {format_length(spec.optics.design_wavelength_m)} it is "
@@ -86,17 +87,6 @@ def _beam_sine(spec: Spec) -> float:
         return 0.0
     tangent = math.hypot(*(math.tan(sum(pair)) for pair in zip(light.angles_rad, light.tilt_rad, strict=True)))
     return tangent / math.hypot(1.0, tangent)
-
-
-def _beam_degrees(spec: Spec) -> float:
-    return math.degrees(math.asin(_beam_sine(spec)))
-
-
-def _full_wave_m(spec: Spec) -> float:
-    """Height (metres) that delays the beam of a spec by one wave at the design wavelength: less, where it is aslant."""
-    material, wavelength_m, sine = spec.doe.material, spec.optics.design_wavelength_m, _beam_sine(spec)
-    index = refractive_index(material, wavelength_m)
-    return wavelength_m / (math.sqrt(index**2 - sine**2) - math.sqrt(1 - sine**2))
 
 
 def _nearly_flat(spec: Spec) -> bool:
