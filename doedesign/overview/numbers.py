@@ -6,6 +6,7 @@ key is the one there, and says of a mean which ("near", "far" or none for all).
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -94,6 +95,10 @@ def _mean(rows: Iterable[Mapping[str, Any]], value: Callable[[Mapping[str, Any]]
     return sum(found) / len(found) if found else None
 
 
+def _get(name: str, row: Mapping[str, Any]) -> Any:
+    return row.get(name)
+
+
 def _percent(share: Any) -> float | None:
     return None if share is None else 100 * float(share)
 
@@ -168,14 +173,29 @@ def _of_aim(found: Any, note: str = "") -> Iterator[MainNumber]:
         yield MainNumber("ceiling", "ceiling of light on target", _percent(one["ceiling"]), "%")
 
 
+_ON_PLATES: tuple[tuple[str, str, str, Literal["high", "low"]], ...] = (
+    ("uniformity_error", "uniformity error", "%", "low"),
+    ("on_target", "light on target", "%", "high"),
+    ("strehl", "relative Strehl ratio", "", "high"),
+)
+
+
+def _of_plates(means: Mapping[str, float | None], words: str = "") -> Iterator[MainNumber]:
+    """The numbers of plates that tell of spots, areas and foci; where none does, how like their design they are."""
+    there = [one for one in _ON_PLATES if means[one[0]] is not None]
+    for key, label, unit, better in [one for one in there if one[0] != "strehl"] or there:
+        mean = means[key]
+        yield MainNumber(key, label + words, _percent(mean) if unit else mean, unit, better)
+
+
 def _of_plate(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
     metrics = read_json(folder / METRICS_FILE)
     rows = metrics["fabricated"]
-    yield MainNumber("strehl", "relative Strehl ratio", _mean(rows, lambda row: row["strehl"]), "", "high")
-    inside = _percent(_mean(rows, lambda row: row["throughput"]))
-    yield MainNumber("throughput", "light in the window", inside, "%", "high")
+    yield from _of_plates({name: _mean(rows, partial(_get, name)) for name, *_ in _ON_PLATES})
     order = _percent(_mean(rows, lambda row: row["zeroth_order"]))
     yield MainNumber("zeroth_order", "0th order", order, "%", note=_zeroth_note(metrics))
+    inside = _percent(_mean(rows, lambda row: row["throughput"]))
+    yield MainNumber("throughput", "light in the window", inside, "%", "high")
 
 
 def tolerance_record(folder: Path) -> dict[str, Any]:
@@ -207,12 +227,13 @@ def _of_tolerance(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
     if plates.get("yield") is not None:
         share = plates["yield"]["share"] if isinstance(plates["yield"], dict) else plates["yield"]
         yield MainNumber("yield", "yield", _percent(share), "%", "high")
-    named = ("strehl", "relative Strehl ratio of plates", ""), ("zeroth_order", "0th order of plates", "%")
-    for key, label, unit in named:
-        rows = [row for row in plates["statistics"] if row["quantity"] == key]
-        if (mean := _mean(rows, lambda row: row["mean"])) is not None:
-            better, note = ("high", "") if key == "strehl" else (None, _note_of_run(folder))
-            yield MainNumber(key, label, 100 * mean if unit else mean, unit, better, note)
+
+    def mean(quantity: str) -> float | None:
+        return _mean((row for row in plates["statistics"] if row["quantity"] == quantity), lambda row: row["mean"])
+
+    yield from _of_plates({name: mean(name) for name, *_ in _ON_PLATES}, " of plates")
+    if (order := mean("zeroth_order")) is not None:
+        yield MainNumber("zeroth_order", "0th order of plates", 100 * order, "%", note=_note_of_run(folder))
     yield MainNumber("plates", "plates", plates["count"], COUNT)
 
 

@@ -5,7 +5,7 @@ replaces one of them, and without a stock process what is not given is zero. `Pr
 The keys of `[process.errors]` are those of `fab.process.DEVIATIONS` without the unit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
@@ -40,6 +40,18 @@ Quantity = Literal[
     "contrast",
     "focus_width",
 ]
+
+
+def leading_quantity(names: Collection[str]) -> str:
+    """The number that plates are told by where no limit names one: that of the task, or the relative Strehl ratio.
+
+    Spots are to be equal, and areas and foci to get the light; the rest should be like its design.
+
+    Args:
+        names: of the numbers that there are, one at least.
+    """
+    return next((name for name in ("uniformity_error", "on_target", "strehl") if name in names), next(iter(names)))
+
 
 Etch = Annotated[float, length(0.1 * NM, 1 * MM)]
 Feature = Annotated[float, length(0.0, 1 * MM)]

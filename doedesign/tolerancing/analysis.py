@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from doedesign.spec import LimitSpec, validated
+from doedesign.spec.process import leading_quantity
 from doedesign.tolerancing.pool import OutOfModel, Rows
 from fab.errors import InputError
 from fab.units import format_length, parse_length
@@ -141,13 +142,13 @@ class Sample:
 
     @property
     def worst_draw(self) -> str:
-        """Key of the draw farthest beyond a limit, or nearest to one; of the lowest Strehl ratio without limits.
+        """Key of the draw farthest beyond a limit, or nearest to one; without limits, the worst by `leading_quantity`.
 
         Draws beyond the model are passed over.
         """
         margins = np.full(len(self.keys), np.inf)
         if not self.limits:
-            quantity = "strehl" if "strehl" in self.values else next(iter(self.values))
+            quantity = leading_quantity(self.values)
             margins = self.worst(quantity) * (1 if QUANTITIES[quantity].worse == "low" else -1)
         for limit in self.limits:
             values = self.values[limit.quantity][:, self.rows_of(limit.quantity, limit.colour, limit.depth_m)]
@@ -178,7 +179,8 @@ class Sample:
 def sample_of(draws: Mapping[str, Rows | OutOfModel], limits: Sequence[LimitSpec] = ()) -> Sample:
     """Sample of the results of some draws.
 
-    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite.
+    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite. What tells of spots,
+    areas and foci comes first.
 
     Raises:
         ValueError: no draw has rows, or two have different colours or depths.
@@ -187,7 +189,8 @@ def sample_of(draws: Mapping[str, Rows | OutOfModel], limits: Sequence[LimitSpec
     if first is None:
         raise ValueError("`draws` must hold at least one draw with rows, but there is none")
     places = _places(first)
-    present = [name for name in QUANTITIES if any(name in row for row in first)]
+    known = [name for name in QUANTITIES if any(name in row for row in first)]
+    present = sorted(known, key=lambda name: not METRICS[name].aimed)
     values = {name: np.full((len(draws), len(places)), np.nan) for name in present}
     for i, (key, found) in enumerate(draws.items()):
         beyond = isinstance(found, OutOfModel)

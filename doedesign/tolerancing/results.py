@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from doedesign.runs.folder import Run
 from doedesign.spec import LimitSpec
+from doedesign.spec.process import leading_quantity
 from doedesign.tolerancing.analysis import QUANTITIES, Sample, Yield, limit_text, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.plots import plot_histograms
@@ -108,7 +109,8 @@ class ToleranceResult:
 
     def __str__(self) -> str:
         """Yield, the most important source of error and the budget, on one line."""
-        quantity, limits, draws = "strehl", self.study.limits, len(self.sample.keys)
+        limits, draws = self.study.limits, len(self.sample.keys)
+        quantity = leading_quantity(self.sample.values)
         words = [f"{draws} plates; without limits there is no yield"]
         if limits:
             words = [f"yield {self.yield_} of {draws} plates"]

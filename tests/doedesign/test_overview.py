@@ -215,6 +215,30 @@ def test_results_inside_a_run_are_listed_under_it(tmp_path: Path):
     assert first.size_bytes < sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
 
 
+@pytest.mark.parametrize(
+    ("means", "told"),
+    [
+        ({"strehl": 0.9, "zeroth_order": 0.1}, ["strehl", "zeroth_order"]),
+        ({"zeroth_order": 0.1, "on_target": 0.8, "strehl": 0.9}, ["on_target", "zeroth_order"]),
+        (
+            {"strehl": 0.9, "on_target": 0.8, "uniformity_error": 0.2, "zeroth_order": 0.1},
+            ["uniformity_error", "on_target", "zeroth_order"],
+        ),
+    ],
+)
+def test_plates_are_told_by_what_their_design_is_for(tmp_path: Path, means: dict[str, float], told: list[str]):
+    run = written(tmp_path / "run")
+    inside = run / "tolerance"
+    inside.mkdir()
+    rows = [{"quantity": name, "mean": mean} for name, mean in means.items()]
+    (inside / "results.json").write_bytes(canonical_json({"plates": {"count": 7, "statistics": rows}}))
+    digests = {"results.json": sha256_file(inside / "results.json")}
+    record = {"format": "doedesign tolerance 1", "run": "small", "results_sha256": digests}
+    (inside / "manifest.json").write_bytes(canonical_json(record))
+    (_, study) = list_results([run])
+    assert [one.key for one in study.numbers] == [*told, "plates"]
+
+
 def test_the_list_as_a_table_and_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     assert call("runs")[0] == 0  # nothing there is no mistake

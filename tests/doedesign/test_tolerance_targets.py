@@ -50,6 +50,16 @@ def test_numbers_of_what_light_should_make_have_a_yield(tmp_path: Path, text: st
     for name in limits:
         assert sample.worst(name)[0] == first[name]
     assert told["on_target"]["std"] > 0
+    assert {next(iter(told)), *list(told)[: len(limits)]} == limits.keys()  # they come first
+
+
+@pytest.mark.slow
+def test_spots_are_told_by_how_equal_they_are(tmp_path: Path):
+    errors = {name: 0.0 for name in ("overlay_x_m", "overlay_y_m", "rotation_rad", "magnification", "sidewall_rad")}
+    found = dd.tolerance(designed(tmp_path, SPOTS), process=PROCESS, errors=errors, draws=2)
+    assert "of the variance of the uniformity error" in str(found)
+    sample = found.sample
+    assert sample.worst_draw == sample.keys[int(np.argmax(sample.worst("uniformity_error")))]
 
 
 @pytest.mark.slow

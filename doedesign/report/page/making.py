@@ -30,6 +30,7 @@ from doedesign.report.page.files import (
     picture_image,
 )
 from doedesign.report.page.numbers import SHARES, label_of, length, number, percent, rounded, value_of
+from doedesign.spec.process import leading_quantity
 from fab.errors import InputError
 from fab.files import read_bytes, read_json, sha256_bytes
 from fab.manifest.records import Manifest
@@ -91,12 +92,12 @@ def _histograms(folder: Path, found: Mapping[str, Any]) -> Iterator[ChartBlock]:
 
 
 def _sensitivities(found: Mapping[str, Any]) -> TableBlock | None:
-    """The errors that move the relative Strehl ratio most, each alone at both ends of its spread."""
+    """The errors that move `leading_quantity` most, each alone at both ends of its spread."""
     effects = [one for one in found.get("one_at_a_time") or [] if one["colour"] is None]
     known = [str(one["quantity"]) for one in effects]
     if not known:
         return None
-    quantity = "strehl" if "strehl" in known else known[0]
+    quantity = leading_quantity(known)
     own = sorted((one for one in effects if one["quantity"] == quantity), key=lambda one: -one["variance"])
     rows = tuple(
         (error_label(one["error"]), value_of(quantity, one["low"]), value_of(quantity, one["expected"]),

@@ -6,10 +6,13 @@ from typing import Any
 from doedesign.report.page.blocks import Bar, BarBlock, PageSection, TableBlock, section
 from doedesign.report.page.files import RunFiles, digest_of, listed_json
 from doedesign.report.page.numbers import SHARES, label_of, length, number, percent, value_of
+from doedesign.spec.process import leading_quantity
 from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
 
 Rows = Sequence[Mapping[str, Any]]
 
+# Limits that may be asked for, by the number that plates are told by.
+_SUCH_AS = {"uniformity_error": "uniformity_error <= 10 %", "on_target": "on_target >= 80 %", "strehl": "strehl >= 0.6"}
 _WIDEST = 4.0  # width of a focus, over that wanted, up to which it is known (`doedesign.focus.depth`)
 
 
@@ -174,7 +177,8 @@ def _yield(tolerance: Mapping[str, Any] | None) -> Iterator[BarBlock | None]:
         return
     plates = tolerance["plates"]
     found = plates["yield"]
-    quantity = "strehl"
+    shares = tolerance.get("shares") or {}
+    quantity = leading_quantity(shares or ["strehl"])
     if found is not None:
         wanted = tolerance["plan"]["wanted"]
         bars = [_share_bar("plates that obey every limit", found, wanted)]
@@ -183,7 +187,6 @@ def _yield(tolerance: Mapping[str, Any] | None) -> Iterator[BarBlock | None]:
         yield BarBlock("Yield", tuple(bars), note)
         worst = min(found["limits"], key=lambda one: one["share"], default=None)
         quantity = quantity if worst is None else worst["limit"].split(" ")[0]
-    shares = tolerance.get("shares") or {}
     by_source = shares.get(quantity) or next(iter(shares.values()), None)
     if by_source:
         name = quantity if quantity in shares else next(iter(shares))
@@ -191,7 +194,8 @@ def _yield(tolerance: Mapping[str, Any] | None) -> Iterator[BarBlock | None]:
         bars = [Bar(source, value, percent(value), 1.0) for source, value in ordered if value >= 5e-4]
         note = f"Share of each source of error in the variance of the {label_of(name)} over all plates."
         if found is None:
-            note += ' No limits were given, so there is no yield: ask with limits such as "strehl >= 0.6".'
+            limit = _SUCH_AS.get(name, "zeroth_order <= 5 %")
+            note += f' No limits were given, so there is no yield: ask with limits such as "{limit}".'
         yield BarBlock("What limits it", tuple(bars), note)
 
 
