@@ -1,8 +1,10 @@
 """Refractive indices of DOE substrates and resists, and what their faces reflect.
 
 Every entry is a dispersion formula with its published coefficients, range and citation. A wavelength
-outside the range is refused, never extrapolated. For other materials an index of one's own, the same at every
-wavelength, stands in place of a name: "n=1.52".
+outside the range is refused, never extrapolated. For other materials an index of one's own stands in place of a name:
+"n=1.52", the same at every wavelength; "n=1.586,V=29.9", that of the yellow helium line (587.56 nm) and the Abbe
+number, as catalogues of glass and plastics have them; "n=1.575,B=0.00785,C=0.0002", the coefficients of Cauchy's formula
+n + B / l^2 + C / l^4, l in micrometres, as data sheets of resists have them.
 """
 
 import math
@@ -133,22 +135,55 @@ MATERIALS: dict[str, Material] = {
         ),
     )
 }
-_OWN_INDEX = re.compile(r"n=(\d\.\d+|\d)")
+_NUMBER = r"(\d+\.\d+|\d+)"
+_OWN_INDEX = re.compile(rf"n={_NUMBER}(?:,V={_NUMBER}|,B=(-?){_NUMBER}(?:,C=(-?){_NUMBER})?)?")
 _LEAST_INDEX, _MOST_INDEX = 1.05, 6.0  # of a substrate
+_LEAST_ABBE, _MOST_ABBE = 10.0, 150.0
+# Fraunhofer's lines, micrometres, and where formulas of so few numbers are taken for good, metres.
+_BLUE_UM, _YELLOW_UM, _RED_UM = 0.4861327, 0.5875618, 0.6562725
+_ABBE_M, _CAUCHY_M = (0.36e-6, 0.85e-6), (0.3e-6, 2e-6)
 
 
 def material(name: str) -> Material:
-    """The material of that name, or that of an index of one's own ("n=1.52"), the same at every wavelength.
+    """The material of that name, or that of an index of one's own; see the top of this file.
 
     Raises:
         InputError: neither; it lists the names that there are.
     """
     if name in MATERIALS:
         return MATERIALS[name]
-    if (own := _OWN_INDEX.fullmatch(name)) and _LEAST_INDEX <= (index := float(own[1])) <= _MOST_INDEX:
-        return Material(name, f"a material of index {index:g}", (0.0, math.inf), _cauchy, ((index, 0),), "")
-    rule = f"must be one of {', '.join(MATERIALS)}, or an index from {_LEAST_INDEX:g} to {_MOST_INDEX:g} as n=1.52"
+    if (own := _own_material(name)) is not None:
+        return own
+    rule = (
+        f"must be one of {', '.join(MATERIALS)}, or an index from {_LEAST_INDEX:g} to {_MOST_INDEX:g} as n=1.52, "
+        "n=1.586,V=29.9 (with its Abbe number) or n=1.575,B=0.00785,C=0.0002 (Cauchy, micrometres)"
+    )
     raise InputError("material", rule, repr(name), "Pick one of these names, or give the index.")
+
+
+def _own_material(name: str) -> Material | None:
+    """A material by its index; None where the text does not say one, or none that a substrate can have."""
+    found = _OWN_INDEX.fullmatch(name)
+    if found is None:
+        return None
+    index, abbe, b_sign, b, c_sign, c = found.groups()
+    told, n = f"a material of index {float(index):g}", float(index)
+    if abbe is not None:
+        if not _LEAST_ABBE <= float(abbe) <= _MOST_ABBE:
+            return None
+        # Cauchy's formula of two terms through both numbers.
+        second = (n - 1.0) / float(abbe) / (_BLUE_UM**-2 - _RED_UM**-2)
+        range_m, terms = _ABBE_M, ((n - second * _YELLOW_UM**-2, 0), (second, -2))
+        told += f" and Abbe number {float(abbe):g}"
+    elif b is not None:
+        range_m, terms = _CAUCHY_M, ((n, 0), (float(b_sign + b), -2), (float(c_sign + c) if c else 0.0, -4))
+        told = f"a material of {name}"
+    else:
+        range_m, terms = (0.0, math.inf), ((n, 0),)
+    ends = [_cauchy(1e6 * end, terms) for end in range_m] if len(terms) > 1 else [n]
+    if not all(_LEAST_INDEX <= one <= _MOST_INDEX for one in ends):
+        return None
+    return Material(name, told, range_m, _cauchy, terms, "")
 
 
 def is_material(name: str) -> bool:

@@ -62,7 +62,9 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 Wavelength = Annotated[float, length(200 * NM, 20 * UM)]
-Substrate = Annotated[str, accepted(is_material, "must be a known material, or an index as n=1.52", MATERIALS)]
+Substrate = Annotated[
+    str, accepted(is_material, "must be a known material, or an index as n=1.52 or n=1.586,V=29.9", MATERIALS)
+]
 Distortion = Annotated[float, share(-10.0, 10.0)]
 SpecName = Annotated[
     str, accepted(_FILE_NAME.fullmatch, "must be a file name of at most 64 letters, digits, dots, dashes")
@@ -180,7 +182,8 @@ class DoeSpec(SpecTable, frozen=True):
             white is the relief: it covers the cells, up in it is +y, and row 0 of an array is the lowest y. The spec
             keeps the open cells (`doedesign.spec.values.aperture`).
         material: substrate, a key of `sim.material.MATERIALS`; of others the refractive index, the same at every
-            wavelength: "n=1.52".
+            wavelength, "n=1.52"; that at 587.56 nm with its Abbe number, "n=1.586,V=29.9"; or Cauchy's coefficients,
+            wavelengths in micrometres, "n=1.575,B=0.00785,C=0.0002".
     """
 
     samples: Samples = Field(examples=["2400"])

@@ -66,10 +66,42 @@ def test_an_index_of_ones_own_stands_for_a_name():
     assert full_wave_wavelength_m("n=1.5", 1.2e-6) == pytest.approx(600e-9, rel=1e-12)
     assert material("n=2").title == "a material of index 2"
     assert is_material("n=1.05")
+    for text in (
+        "n=1,V=30",
+        "n=1.5,V=9",
+        "n=1.5,V=-30",
+        "n=1.5,V=",
+        "n=1.5,B=1",
+        "n=1.5,C=0.1",
+        "n=1.5,B=0.1,V=30",
+        "n=1.5, V=30",
+    ):
+        assert not is_material(text), text
     for text in ("n=1", "n=6.01", "n=12.5", "n=-1.5", "n=1.5e0", "n=nan", "n = 1.5", "1.5", "n=", "n=1.5\n"):
         assert not is_material(text)
-        with pytest.raises(InputError, match=r"or an index from 1.05 to 6 as n=1\.52"):
+        with pytest.raises(InputError, match=r"or an index from 1.05 to 6 as n=1\.52, n=1\.586,V=29\.9"):
             material(text)
+
+
+@pytest.mark.parametrize(("name", "nd", "abbe"), [("n_bk7", 1.5168, 64.17), ("fused_silica", 1.4585, 67.82)])
+def test_an_abbe_number_gives_the_dispersion_of_the_visible(name: str, nd: float, abbe: float):
+    """The two numbers of catalogues against the published formula: what two terms of Cauchy leave is 0.0004 at most."""
+    own = f"n={nd},V={abbe}"
+    for wavelength_nm in (400, 440, 486, 550, 620, 656, 700, 780):
+        there = refractive_index(name, wavelength_nm * 1e-9)
+        assert refractive_index(own, wavelength_nm * 1e-9) == pytest.approx(there, abs=4e-4)
+    blue, yellow, red = (refractive_index(own, w * 1e-6) for w in (0.4861327, 0.5875618, 0.6562725))
+    assert (yellow, (yellow - 1) / (blue - red)) == pytest.approx((nd, abbe), rel=1e-9)
+    with pytest.raises(InputError, match="360-850 nm"):
+        refractive_index(own, 1.06e-6)
+
+
+def test_coefficients_of_cauchy_are_those_of_a_data_sheet():
+    own = "n=1.566,B=0.00796,C=0.00014"
+    for wavelength in (350e-9, 405e-9, 633e-9):
+        assert refractive_index(own, wavelength) == pytest.approx(refractive_index("su8", wavelength), rel=1e-12)
+    assert refractive_index("n=1.5,B=-0.001", 500e-9) == pytest.approx(1.496, rel=1e-12)
+    assert full_wave_wavelength_m(own, full_wave_height_m(own, 532e-9)) == pytest.approx(532e-9, rel=1e-9)
 
 
 def record(path: Path) -> tuple[int, list[float], tuple[float, float]]:
