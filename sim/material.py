@@ -2,9 +2,10 @@
 
 Every entry is a dispersion formula with its published coefficients, range and citation. A wavelength
 outside the range is refused, never extrapolated. For other materials an index of one's own stands in place of a name:
-"n=1.52", the same at every wavelength; "n=1.586,V=29.9", that of the yellow helium line (587.56 nm) and the Abbe
-number, as catalogues of glass and plastics have them; "n=1.575,B=0.00785,C=0.0002", the coefficients of Cauchy's formula
-n + B / l^2 + C / l^4, l in micrometres, as data sheets of resists have them.
+
+- "n=1.52", the same at every wavelength;
+- "n=1.586,V=29.9", that of the yellow helium line (587.56 nm) and the Abbe number, as in catalogues of glass;
+- "n=1.575,B=0.00785,C=0.0002", Cauchy's n + B / l^2 + C / l^4, l in micrometres, as in data sheets of resists.
 """
 
 import math
