@@ -89,6 +89,24 @@ def broken(task, y0, x0, y1, x1):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
+def _with_broken(task, weight, change, best, y0, x0, y1, x1):  # pragma: no cover - compiled
+    # `change` and the weight of all that is broken about a rectangle, or infinity as soon as that is not below `best`:
+    # what is looked at last can only add.
+    reach = max(task.line, task.space)
+    total = _kissing(task.etched, y0, x0, y1, x1)
+    if reach > 1:
+        for y in range(y0, y1):
+            if change + weight * total >= best:
+                return np.inf
+            total += task.gravity * _deficit(task, y, x0, 0, 1, -reach, x1 - x0)
+        for x in range(x0, x1):
+            if change + weight * total >= best:
+                return np.inf
+            total += task.gravity * _deficit(task, y0, x, 1, 0, -reach, y1 - y0)
+    return change + weight * total
+
+
+@njit(cache=True, nogil=True)
 def offends(task, y, x):  # pragma: no cover - compiled
     """Whether a pixel itself lies in a short run or at a kissing corner."""
     if _kissing(task.etched, y, x, y + 1, x + 1):
@@ -205,7 +223,7 @@ def _improve(task, walls, scratch, y, x, weight, sound):  # pragma: no cover - c
                             kept[v - y0, u - x0] = etched[v, u]
                         etched[v, u] = depths[i]
                 written = True
-                change += weight * broken(task, y0, x0, y1, x1)
+                change = _with_broken(task, weight, change, best, y0, x0, y1, x1)
             if change < best:
                 best, best_depth = change, depths[i]
                 best_y, best_x, best_high, best_wide = y0, x0, high, wide
@@ -243,6 +261,12 @@ def sweep(task, first, last, weight, changed_too, sound):  # pragma: no cover - 
             seen = changed_too and own != task.wanted[y, x]
             if changed_too and task.wall.size and not seen:
                 seen = not own == etched[y, x - 1] == etched[y, x + 1] == etched[y - 1, x] == etched[y + 1, x]
-            if seen or (not sound and offends(task, y, x)):
+            if seen and not sound:
+                # One look at all that its moves may touch, where little is broken, spares one at every move.
+                y0, x0, y1, x1 = max(y - reach + 1, task.pad), max(x - reach + 1, task.pad), y + reach, x + reach
+                end_y, end_x = etched.shape[0] - task.pad, etched.shape[1] - task.pad
+                whole = broken(task, y0, x0, min(y1, end_y), min(x1, end_x)) == 0
+                moved += _improve(task, walls, scratch, y, x, weight, whole)
+            elif seen or (not sound and offends(task, y, x)):
                 moved += _improve(task, walls, scratch, y, x, weight, sound)
     return moved
