@@ -47,7 +47,7 @@ from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.search import least
 from doedesign.spec import Spec, input_files
-from doedesign.spots.orders import OrderTable
+from doedesign.spots.orders import OrderTable, OrderTables
 from fab.errors import InputError
 from fab.files import canonical_json, csv_table, sha256_bytes, write_atomic
 from fab.layout.geometry import pixel_edges
@@ -348,8 +348,11 @@ def _miss(design: Design, spec: Spec, plate: FabricatedDoe) -> float:
     found = on_target(design, plate)
     if isinstance(found, FocusTable):
         return found.loss
-    assert isinstance(found, OrderTable)
     assert spec.spots is not None
+    if isinstance(found, OrderTables):
+        light, unequal = float(np.mean([one.total for one in found.tables])), found.measures()["uniformity_error"]
+        return 1.0 - light + spec.spots.uniformity * unequal
+    assert isinstance(found, OrderTable)
     # Where phases are given, light counts in the wave that they make.
     light = found.total if found.wave is None else found.wave.share
     return 1.0 - light + spec.spots.uniformity * found.uniformity_error

@@ -18,7 +18,7 @@ from sim.surface import FabricatedDoe, as_fabricated
 if TYPE_CHECKING:
     from doedesign.areas.shape import AreaTable, AreaTables
     from doedesign.focus.depth import FocusTable
-    from doedesign.spots.orders import OrderTable
+    from doedesign.spots.orders import OrderTable, OrderTables
 
 
 class Prediction(NamedTuple):
@@ -48,7 +48,9 @@ def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[di
     return metric_rows(bank.metric_inputs(design.near_m, surface, nominal, aimed=aimed), "fabricated")
 
 
-def on_target(design: Design, doe: CellOptic) -> "OrderTable | AreaTable | AreaTables | FocusTable | None":
+def on_target(
+    design: Design, doe: CellOptic
+) -> "OrderTable | OrderTables | AreaTable | AreaTables | FocusTable | None":
     """Light on what a design should make, spots, an area or foci, of the design as drawn or as fabricated.
 
     None for a design that should make none of them.

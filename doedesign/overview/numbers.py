@@ -106,7 +106,9 @@ def _percent(share: Any) -> float | None:
 def _zeroth_note(metrics: Mapping[str, Any]) -> str:
     """The note on the 0th order of spots: whether it is one of them."""
     orders = metrics.get("orders") or {}
-    tables = [orders, *(one for one in orders.values() if isinstance(one, dict))]  # of plates: several
+    # Of plates as drawn and as made, of several colours a list.
+    found = [orders, *orders.values()] if isinstance(orders, dict) else [orders]
+    tables = [one for part in found for one in (part if isinstance(part, list) else [part]) if isinstance(one, dict)]
     return ONE_OF_THE_SPOTS if any(table.get("zeroth_order_wanted") for table in tables) else ""
 
 
@@ -150,14 +152,15 @@ def _of_run(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
 
 
 def _of_aim(found: Any, note: str = "") -> Iterator[MainNumber]:
-    """Numbers of spots, areas or foci, of several areas the worst; with a note on the 0th order."""
+    """Numbers of spots, areas or foci, of several areas or colours the worst; with a note on the 0th order."""
     tables = found if isinstance(found, list) else [found]
     one = tables[0]
     if "on_target" in one:
         share = min(each["on_target"] for each in tables)
         yield MainNumber("on_target", "light on target", _percent(share), "%", "high")
     if "uniformity_error" in one:
-        yield MainNumber("uniformity_error", "uniformity error", _percent(one["uniformity_error"]), "%", "low")
+        worst = max(each["uniformity_error"] for each in tables)
+        yield MainNumber("uniformity_error", "uniformity error", _percent(worst), "%", "low")
     if "contrast" in one:
         worst = max(each["contrast"] for each in tables)
         yield MainNumber("contrast", "contrast of the area", _percent(worst), "%", "low")

@@ -28,7 +28,7 @@ from sim.surface.leakage import SplitPsf, split_psf
 if TYPE_CHECKING:
     from doedesign.areas.shape import AreaTable, AreaTables
     from doedesign.focus.depth import FocusTable
-    from doedesign.spots.orders import OrderTable
+    from doedesign.spots.orders import OrderTable, OrderTables
 
 # Interference beyond what two fields can do is rounding of single precision, far below one part in a thousand; of sharp
 # spots the transform's own error is as much, so that they are looked at again with as many samples as leave none of it.
@@ -55,7 +55,7 @@ class FabricatedPsfs(NamedTuple):
     splits: dict[tuple[int, int], SplitPsf]
     rows: dict[str, list[dict[str, Any]]]
     variation: Variation
-    aimed: "dict[str, OrderTable | AreaTable | AreaTables | FocusTable]"
+    aimed: "dict[str, OrderTable | OrderTables | AreaTable | AreaTables | FocusTable]"
 
 
 def fabricated(

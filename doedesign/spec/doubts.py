@@ -47,7 +47,13 @@ def _colour_warning(spec: Spec) -> Iterator[str]:
     """Warn that spots and areas without a colour are for the first wavelength, where that is not the design one."""
     wavelengths = [wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m]
     listed = any(math.isclose(each, spec.optics.design_wavelength_m, rel_tol=1e-6) for each in wavelengths[1:])
-    own = "spots" if spec.spots else "area" if any(area.colour is None for area in spec.areas) else ""
+    own = (
+        "spots"
+        if spec.spots and not spec.spots.colours
+        else "area"
+        if any(area.colour is None for area in spec.areas)
+        else ""
+    )
     if own and listed and not math.isclose(wavelengths[0], spec.optics.design_wavelength_m, rel_tol=1e-6):
         design, first = (format_length(each) for each in (spec.optics.design_wavelength_m, wavelengths[0]))
         cure = "List it first" + (", or give every area its colour." if own == "area" else ".")

@@ -2,6 +2,7 @@
 
 spots          where spots lie and how much light each should have
 superposition  weighted Gerchberg-Saxton, levels in the loop
+shared_levels  the level of a cell that suits several colours
 search         phases of the spots, by many starts at once
 exchange       single cells of a small unit cell, changed one by one
 plates         spots of many plates as fabricated, kept equal by exchange

@@ -14,11 +14,11 @@ from doedesign.spec import Spec
 from doedesign.spec.targets.arrangements import grid_orders
 from doedesign.spec.targets.spots import MOST_CELLS, SpotsSpec, places_of
 from doedesign.spots.exchange import exchange
-from doedesign.spots.orders import OrderTable, order_table
+from doedesign.spots.orders import OrderTable, OrderTables, order_table
 from doedesign.spots.plates import SpotPlates, plates_of
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, shares_of
-from doedesign.spots.superposition import SpotLight, SpotProblem, Staircase, WaveSet
+from doedesign.spots.superposition import SharedProblem, SpotLight, SpotProblem, Staircase, WaveSet
 from fab.draws import varying
 from fab.errors import InputError
 from fab.grid import Grid
@@ -71,7 +71,7 @@ class SpotTask:
     table: SpotsSpec
     camera: Camera
     levels: Levels
-    problem: SpotProblem
+    problem: SpotProblem | SharedProblem
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "SpotTask":
@@ -85,19 +85,8 @@ class SpotTask:
             key, cure = "spots.uniformity_as_fabricated", 'For example process.stock = "contact_aligner".'
             raise InputError(key, "plates must differ", "a process without errors", cure)
         camera, levels = camera_from_spec(spec), levels_from_spec(spec.process)
-        spots = spots_from_spec(spec.spots, camera)
-        rate = camera.waves_per_metre(camera.lines[0].wavelength_m)
-        staircase = Staircase.of(2 * np.pi * rate * levels.heights_m())
-        grid, coverage = camera.grid, open_cells(camera.grid, camera.opening)
-        if camera.beam is not None:
-            coverage = (coverage * camera.irradiance(camera.lines[0].wavelength_m)).astype(np.float32)
-        if spec.spots.period_m is not None:
-            grid = unit_cell(spec.spots, camera)
-            coverage = np.ones(grid.shape, np.float32)
-            # The first cell begins where the DOE does.
-            y_m, x_m = ((own - whole) / 2 * grid.pitch_m for own, whole in zip(grid.shape, spec.doe.shape, strict=True))
-            spots = spots.about((y_m, x_m))
-        return cls(spec, spec.spots, camera, levels, SpotProblem.on(grid, coverage, spots, staircase))
+        parts = [_problem_of(spec, camera, levels, colour) for colour in colour_numbers(spec.spots, camera)]
+        return cls(spec, spec.spots, camera, levels, parts[0] if len(parts) == 1 else SharedProblem.of(parts))
 
     @property
     def periodic(self) -> bool:
@@ -110,11 +99,14 @@ class SpotTask:
         if problem.spots.phases is not None:
             waves = WaveSet(np.sqrt(problem.spots.shares), problem.spots.phases)
             return SpotState(waves, waves, -np.inf, 0)
-        few = problem.staircase if self.levels.count <= _FEW_LEVELS else None
+        if isinstance(problem, SharedProblem):
+            looked_at = [one.staircase for one in problem.parts]
+        else:
+            looked_at = [problem.staircase] if self.levels.count <= _FEW_LEVELS else []
         points = search_points(problem.spots, self.spec.optimize.seed, problem.grid.extent_m)
         found = search_phases(
             problem.spots, points, starts=table.starts, seed=self.spec.optimize.seed, uniformity=table.uniformity,
-            staircase=few, keep=_TRIED,
+            staircases=looked_at, keep=_TRIED,
         )  # fmt: skip
         tried = [self._after(SpotState(waves, waves, -np.inf, 0), _TRIAL_STEPS) for waves in found.waves]
         return max(tried, key=lambda state: state.merit)._replace(step=0)
@@ -186,7 +178,9 @@ class SpotTask:
 
     def plates(self, count: int) -> SpotPlates:
         """So many plates with the errors of the spec's process."""
-        process, rate = process_from_spec(self.spec.process), self.camera.waves_per_metre(self._wavelength_m)
+        assert isinstance(self.problem, SpotProblem)  # plates are looked at in one colour
+        wavelength_m = wavelength_of(self.camera, colour_numbers(self.table, self.camera)[0])
+        process, rate = process_from_spec(self.spec.process), self.camera.waves_per_metre(wavelength_m)
         return SpotPlates.of(self.problem, process, rate, plates_of(process, count, self.spec.optimize.seed))
 
     def _kept_equal(self, level: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
@@ -226,27 +220,25 @@ class SpotTask:
         turns = 2 * np.pi * np.arange(self.levels.count) / self.levels.count
         return [self.problem.level(waves._replace(phases=waves.phases + turn)) for turn in turns]
 
-    @property
-    def _wavelength_m(self) -> float:
-        return self.camera.lines[0].wavelength_m
-
     def _row(self) -> UInt8[np.ndarray, "y x"]:
         """A row of few levels, from random ones by exchange, first in wide cells and then in narrower ones."""
         problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
-        finer = [problem]
-        while max(shape := finer[-1].coverage.shape) % 2 == 0 and max(shape) // 2 >= _NARROWEST:
+        finer: list[SpotProblem | SharedProblem] = [problem]
+        while max(shape := finer[-1].grid.shape) % 2 == 0 and max(shape) // 2 >= _NARROWEST:
             finer.append(finer[-1].coarser())
         finer.reverse()
         rng, found = np.random.default_rng((seed, 0xD077)), []
         for start in range(_ROW_STARTS):
-            level = rng.integers(0, self.levels.count, finer[0].coverage.shape).astype(np.uint8)
+            level = rng.integers(0, self.levels.count, finer[0].grid.shape).astype(np.uint8)
             level = exchange(finer[0], level, sweeps=_ROW_SWEEPS, seed=start, uniformity=uniformity, heat=_ROW_HEAT)
             found.append((finer[0].light(level).merit(uniformity), start, level))
         found.sort(key=lambda each: (-each[0], each[1]))
         refined = [self._refined(level, finer[1:]) for _, _, level in found[: _ROW_STARTS // 10]]
         return max(refined, key=lambda level: problem.light(level).merit(uniformity))
 
-    def _refined(self, level: UInt8[np.ndarray, "y x"], finer: list[SpotProblem]) -> UInt8[np.ndarray, "y x"]:
+    def _refined(
+        self, level: UInt8[np.ndarray, "y x"], finer: "list[SpotProblem | SharedProblem]"
+    ) -> UInt8[np.ndarray, "y x"]:
         """A row in narrower and narrower cells."""
         seed, uniformity = self.spec.optimize.seed, self.table.uniformity
         for one in finer:
@@ -255,13 +247,47 @@ class SpotTask:
         return level
 
 
-def orders_of_design(design: Design, doe: CellOptic) -> OrderTable:
-    """Table of the spots of a design's spec, of the design as drawn or as fabricated."""
+def _problem_of(spec: Spec, camera: Camera, levels: Levels, colour: int) -> SpotProblem:
+    """The spots of a spec in one of its colours."""
+    assert spec.spots is not None
+    wavelength_m, spots = wavelength_of(camera, colour), spots_from_spec(spec.spots, camera, colour)
+    staircase = Staircase.of(2 * np.pi * camera.waves_per_metre(wavelength_m) * levels.heights_m())
+    grid, coverage = camera.grid, open_cells(camera.grid, camera.opening)
+    if camera.beam is not None:
+        coverage = (coverage * camera.irradiance(wavelength_m)).astype(np.float32)
+    if spec.spots.period_m is not None:
+        grid = unit_cell(spec.spots, camera)
+        coverage = np.ones(grid.shape, np.float32)
+        # The first cell begins where the DOE does.
+        y_m, x_m = ((own - whole) / 2 * grid.pitch_m for own, whole in zip(grid.shape, spec.doe.shape, strict=True))
+        spots = spots.about((y_m, x_m))
+    return SpotProblem.on(grid, coverage, spots, staircase)
+
+
+def colour_numbers(table: SpotsSpec, camera: Camera) -> tuple[int, ...]:
+    """Which of a camera's colours should get the spots."""
+    names = [colour.name for colour in camera.colours]
+    return tuple(map(names.index, table.colours)) or (0,)
+
+
+def wavelength_of(camera: Camera, colour: int) -> float:
+    """First wavelength of a colour, metres: the one that spots are designed and looked at for."""
+    return next(line.wavelength_m for line in camera.lines if line.colour == colour)
+
+
+def orders_of_design(design: Design, doe: CellOptic) -> OrderTable | OrderTables:
+    """Table of the spots of a design's spec, as drawn or as fabricated; one for each of several colours."""
     assert design.spec is not None
-    table = design.spec.spots
+    table, camera = design.spec.spots, design.camera
     assert table is not None
-    spots = spots_from_spec(table, design.camera)
-    return order_table(doe, spots, period_m=table.period_m, count=table.count, levels=design.levels.count)
+    numbers = colour_numbers(table, camera)
+    found = tuple(
+        order_table(
+            doe, spots_from_spec(table, camera, number), colour=number, period_m=table.period_m, count=table.count,
+            levels=design.levels.count,
+        ) for number in numbers
+    )  # fmt: skip
+    return found[0] if len(found) == 1 else OrderTables(found, tuple(camera.colours[one].name for one in numbers))
 
 
 def unit_cell(table: SpotsSpec, camera: Camera) -> Grid:
@@ -279,9 +305,9 @@ def repeated(level: UInt8[np.ndarray, "v u"], grid: Grid) -> UInt8[np.ndarray, "
     return np.tile(level, (-(-ny // height), -(-nx // width)))[:ny, :nx]
 
 
-def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
-    """Spots of a table, for the first wavelength of a camera; from the direction in which light arrives."""
-    wavelength = camera.lines[0].wavelength_m
+def spots_from_spec(table: SpotsSpec, camera: Camera, colour: int = 0) -> Spots:
+    """Spots of a table, for the first wavelength of one of a camera's colours; from where light arrives."""
+    wavelength = wavelength_of(camera, colour)
     shares = shares_of(table.weights, table.spot_count)
     phases = np.array(table.phases_rad) if table.phases_rad else None
     if table.period_m is not None:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from doedesign.spots.superposition import SpotProblem
+from doedesign.spots.superposition import SharedProblem, SpotProblem
 
 FLAT = 1.4  # (max - min) / (max + min) over that root, about
 _ANY, _ANY_OF_TWO = 0.5, 0.1  # share of offers of another level than a neighbour's
@@ -14,7 +14,7 @@ _COLD = 0.3  # share of the sweeps that take improvements alone
 
 
 def exchange(
-    problem: SpotProblem,
+    problem: SpotProblem | SharedProblem,
     level: NDArray[np.uint8],
     *,
     sweeps: int,
@@ -33,17 +33,16 @@ def exchange(
     a neighbour, which moves a border between levels, or now and then another, most often the next. The best map that
     was met is returned; by this measure it is never worse than the one given.
     """
-    sums, spots, shares = problem.sums, problem.spots, problem.spots.shares
+    spots, waves, light_of = problem.spots, problem.cell_waves, problem.level_light
     wanted = np.zeros(0, complex) if spots.phases is None else spots.wave.conj()
-    waves = (sums.along_y[:, :, None] * sums.along_x[:, None, :]).reshape(len(shares), -1).T.astype(np.complex128)
-    waves = waves / float(np.sum(problem.coverage, dtype=np.float64)) * problem.coverage.reshape(-1, 1)
     rng = np.random.default_rng((seed, 0xE8C4))
-    own, count = level.reshape(-1).copy(), len(problem.staircase.light)
+    own, count = level.reshape(-1).copy(), len(light_of)
     best = own.copy()
     for sweep in range(sweeps):
         offer = offers(rng, own.size, count, _ANY_OF_TWO if count == 2 else _ANY)
-        _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, wanted, level.shape, *offer,
-               cooled(heat, sweep, sweeps), uniformity)  # fmt: skip
+        heat_now = cooled(heat, sweep, sweeps)
+        _sweep(own, best, waves, light_of, spots.shares, spots.colours, wanted, level.shape, *offer, heat_now,
+               uniformity)  # fmt: skip
     return best.reshape(level.shape)
 
 
@@ -96,19 +95,21 @@ def offered(level: Any, y: int, x: int, other: int, side: int, levels: int) -> i
 
 
 @njit(cache=True, nogil=True)
-def _merit(light: Any, shares: Any, wanted: Any, uniformity: float) -> float:
-    total, over = 0.0, 0.0
-    for k in range(len(light)):
-        power = light[k].real ** 2 + light[k].imag ** 2
-        total += power
-        over += power / shares[k]
+def _merit(light: Any, shares: Any, colours: int, wanted: Any, uniformity: float) -> float:
+    total, spread, count = 0.0, 0.0, len(light) // colours
+    for first in range(0, len(light), count):  # spots of every colour are held against their own mean
+        over = 0.0
+        for k in range(first, first + count):
+            power = light[k].real ** 2 + light[k].imag ** 2
+            total += power
+            over += power / shares[k]
+        mean = max(over / count, 1e-300)
+        for k in range(first, first + count):
+            off = (light[k].real ** 2 + light[k].imag ** 2) / shares[k] / mean - 1.0
+            spread += off**4
     if len(wanted):
         wave = np.sum(wanted * light)
         total = wave.real**2 + wave.imag**2
-    mean, spread = max(over / len(light), 1e-300), 0.0
-    for k in range(len(light)):
-        off = (light[k].real ** 2 + light[k].imag ** 2) / shares[k] / mean - 1.0
-        spread += off**4
     return total - uniformity * (spread / len(light)) ** 0.25 * FLAT
 
 
@@ -119,6 +120,7 @@ def _sweep(
     waves: NDArray[np.complex128],
     light_of: NDArray[np.complex128],
     shares: NDArray[np.float64],
+    colours: int,
     wanted: NDArray[np.complex128],
     shape: tuple[int, int],
     order: Any,
@@ -133,14 +135,15 @@ def _sweep(
     for cell in range(len(own)):
         light += light_of[own[cell]] * waves[cell]
         kept += light_of[best[cell]] * waves[cell]
-    merit, highest = _merit(light, shares, wanted, uniformity), _merit(kept, shares, wanted, uniformity)
+    merit = _merit(light, shares, colours, wanted, uniformity)
+    highest = _merit(kept, shares, colours, wanted, uniformity)
     drawn, nx = own.reshape(shape), shape[1]
     for cell, throw, other, side in zip(order, chance, others, sides):  # noqa: B905 - numba knows no strict
         level = offered(drawn, cell // nx, cell % nx, other, side, len(light_of))
         if level == own[cell]:
             continue
         tried = light + (light_of[level] - light_of[own[cell]]) * waves[cell]
-        found = _merit(tried, shares, wanted, uniformity)
+        found = _merit(tried, shares, colours, wanted, uniformity)
         if found >= merit or (heat > 0 and throw < np.exp((found - merit) / heat)):
             own[cell], light, merit = level, tried, found
             if merit > highest:

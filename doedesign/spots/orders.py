@@ -201,6 +201,53 @@ class OrderTable:
         return plot_orders(self, ax)
 
 
+@dataclass(frozen=True)
+class OrderTables:
+    """Light of the spots of several colours.
+
+    Attributes:
+        tables: one for each colour.
+        colours: their names.
+    """
+
+    tables: tuple[OrderTable, ...]
+    colours: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of its files and of its entry among metrics."""
+        return "orders"
+
+    def summary(self) -> list[dict[str, Any]]:
+        """All numbers of every colour, for metrics."""
+        return [{"colour": name, **one.summary()} for name, one in zip(self.colours, self.tables, strict=True)]
+
+    def measures(self) -> dict[str, float]:
+        """Numbers that a tolerance study follows: those of the worst colour."""
+        return {
+            "on_target": min(one.total for one in self.tables),
+            "uniformity_error": max(one.uniformity_error for one in self.tables),
+        }
+
+    def describe(self) -> str:
+        """A line for every colour."""
+        return "\n".join(f"{name}: {one.describe()}" for name, one in zip(self.colours, self.tables, strict=True))
+
+    def to_csv(self) -> str:
+        """The tables of `OrderTable.to_csv`, every line after the name of its colour."""
+        head, lines = "", []
+        for name, one in zip(self.colours, self.tables, strict=True):
+            head, *rows = one.to_csv().splitlines()
+            lines += [f"{name},{row}" for row in rows]
+        return "\n".join([f"colour,{head}", *lines]) + "\n"
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the spots of every colour below each other; on `ax`, or on a new figure."""
+        from doedesign.report.spots import plot_colours
+
+        return plot_colours(self, ax)
+
+
 def order_table(
     optic: CellOptic,
     spots: Spots,
@@ -208,19 +255,21 @@ def order_table(
     period_m: float | None = None,
     count: tuple[int, int] | None = None,
     levels: int = 0,
+    colour: int = 0,
 ) -> OrderTable:
     """Look at the spots of a DOE: as drawn, as fabricated, with or without the light of its walls.
 
     Args:
-        optic: the DOE; its first wavelength is looked at.
+        optic: the DOE.
         spots: where light should go.
         period_m: side of a unit cell that is repeated, metres. Only whole periods within the aperture, in a square if
             it is round, are looked at, as if there were no end of them: behind a round aperture the feet of bright
             neighbours add to a peak, and so they do where a mask closes corners of a rectangle.
         count: columns and rows of a grid of equal spots, for the ceiling.
         levels: levels of the DOE, for the ceiling.
+        colour: number of the colour whose first wavelength is looked at.
     """
-    camera, line = optic.camera, optic.camera.lines[0]
+    camera, line = optic.camera, next(one for one in optic.camera.lines if one.colour == colour)
     # Directions are what a lens would show in its focus, whatever the light on the DOE and the way behind it.
     away = camera.distance_m is not None and not camera.in_angles
     focal = {"distance_m": None, "focal_length_m": camera.distance_m} if away else {}

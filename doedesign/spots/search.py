@@ -3,16 +3,18 @@
 How much light a DOE can send into spots depends on the phases that they may have among each other, and on nothing else.
 Where spots lie on a lattice of directions, one period of the DOE says all; elsewhere, a few thousand random points
 stand for the cells. All starts take their steps together, as matrix products; on a lattice of many orders axis by axis,
-because a matrix of all spots and points would have gigabytes.
+because a matrix of all spots and points would have gigabytes. Of several colours every point takes a level that suits
+all of them, since a height has another phase for each.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from doedesign.spots.spots import Spots
-from doedesign.spots.superposition import Staircase, WaveSet, spot_light
+from doedesign.spots.superposition import Staircase, WaveSet, shared_level, spot_light
 
 _STEPS = 100
 _POINTS_PER_ORDER, _FEWEST, _SCATTERED = 8, 24, 4096
@@ -94,7 +96,7 @@ def search_phases(
     starts: int,
     seed: int,
     uniformity: float,
-    staircase: Staircase | None = None,
+    staircases: Sequence[Staircase] = (),
     keep: int = 4,
 ) -> FoundPhases:
     """Search the plane waves whose sum is nearest to a phase alone, where the phases of spots are free.
@@ -105,31 +107,37 @@ def search_phases(
         starts: random starts.
         seed: of these.
         uniformity: weight of the uniformity error beside the efficiency.
-        staircase: levels that the DOE may have; any phase if there is none.
+        staircases: levels that the DOE may have, in the light of every colour; any phase if there are none, which one
+            colour alone can have.
         keep: how many to return.
     """
     on_grid = spots.lattice_per_m is not None and spots.count * len(points_m) > _DENSE
-    waves = (_LatticeWaves if on_grid else _Waves).of(spots, points_m)
+    waves = [(_LatticeWaves if on_grid else _Waves).of(part, points_m) for part in spots.parts]
     rng, found = np.random.default_rng((seed, 0x57A7)), []
     batch = max(1, min(starts, _BATCH // len(points_m)))
     for first in range(0, starts, batch):
         count = min(batch, starts - first)
         sets = WaveSet(np.tile(np.sqrt(spots.shares), (count, 1)), rng.uniform(0, 2 * np.pi, (count, spots.count)))
-        light = _light(sets, waves, staircase)
+        light = _light(sets, waves, staircases)
         for _ in range(_STEPS):
             sets = sets.improved(light, spots)
-            light = _light(sets, waves, staircase)
+            light = _light(sets, waves, staircases)
         for weights, phases, one in zip(*sets, light, strict=True):
-            result = spot_light(np.abs(one) ** 2, spots.shares)
+            result = spot_light(np.abs(one) ** 2, spots.shares, spots.colours)
             found.append((result.merit(uniformity), result.efficiency, WaveSet(weights, phases)))
     found.sort(key=lambda each: -each[0])
     return FoundPhases([each[2] for each in found[:keep]], found[0][1])
 
 
-def _light(sets: WaveSet, waves: _Waves | _LatticeWaves, staircase: Staircase | None) -> Complex[np.ndarray, "start m"]:
-    field = waves.superposition(sets.amplitudes.astype(np.complex64))
-    if staircase is None:
-        field /= np.maximum(np.abs(field), 1e-12)
+def _light(
+    sets: WaveSet, waves: Sequence[_Waves | _LatticeWaves], staircases: Sequence[Staircase]
+) -> Complex[np.ndarray, "start m"]:
+    amplitudes = np.split(sets.amplitudes.astype(np.complex64), len(waves), axis=1)
+    fields = [one.superposition(own) for one, own in zip(waves, amplitudes, strict=True)]
+    if staircases:
+        level = shared_level(fields, staircases)
+        fields = [one.light[level] for one in staircases]
     else:
-        field = staircase.light[staircase.level(field)]
-    return waves.amplitudes(field).astype(np.complex128) / field.shape[1]
+        fields[0] /= np.maximum(np.abs(fields[0]), 1e-12)
+    light = [one.amplitudes(field).astype(np.complex128) for one, field in zip(waves, fields, strict=True)]
+    return np.concatenate(light, axis=1) / (fields[0].shape[1] * np.sqrt(len(waves)))

@@ -18,6 +18,7 @@ class Spots:
         lattice_per_m: distance (y, x) of that lattice, waves per metre, or None.
         phases: `[spot]` phase that each plane wave should have in the middle of the DOE, radians, but for one that all
             have in common; None where phases are free.
+        colours: how many colours have spots; those of each follow those of the one before, equally many.
     """
 
     waves_per_m: Float[np.ndarray, "m 2"]
@@ -25,10 +26,44 @@ class Spots:
     orders: Int[np.ndarray, "m 2"] | None = None
     lattice_per_m: tuple[float, float] | None = None
     phases: Float[np.ndarray, " m"] | None = None
+    colours: int = 1
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Spots]") -> "Spots":
+        """Spots of several colours, each colour with the same light. Their phases are free.
+
+        Args:
+            parts: those of every colour, equally many.
+        """
+        first, count = parts[0], len(parts)
+        waves = np.concatenate([one.waves_per_m for one in parts])
+        named = [one.orders for one in parts if one.orders is not None]
+        orders = np.concatenate(named) if len(named) == count else None
+        # Orders of a unit cell have one lattice for all colours, places on a sensor do not.
+        alike = all(one.lattice_per_m == first.lattice_per_m for one in parts)
+        shares = np.concatenate([one.shares for one in parts]) / count
+        return cls(waves, shares, orders, first.lattice_per_m if alike else None, colours=count)
+
+    @property
+    def parts(self) -> "tuple[Spots, ...]":
+        """The spots of every colour alone."""
+        if self.colours == 1:
+            return (self,)
+        orders = [None if self.orders is None else self.orders[own] for own in self.of_colours]
+        return tuple(
+            Spots(self.waves_per_m[own], self.colours * self.shares[own], named, self.lattice_per_m)
+            for own, named in zip(self.of_colours, orders, strict=True)
+        )
+
+    @property
+    def of_colours(self) -> tuple[slice, ...]:
+        """Which spots those of every colour are."""
+        count = self.count // self.colours
+        return tuple(slice(at, at + count) for at in range(0, self.count, count))
 
     @property
     def count(self) -> int:
-        """Number of spots."""
+        """Number of spots, those of all colours together."""
         return len(self.shares)
 
     def about(self, place_m: tuple[float, float]) -> "Spots":

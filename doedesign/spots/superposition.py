@@ -6,14 +6,20 @@ rounds it to the nearest level that the process makes, looks at the light of eve
 out, and gives more weight to spots that are too dark (R. Di Leonardo et al., Opt. Express 15, 1913, 2007). Because the
 rounded plate is what is looked at, its errors are made up for, too. Where the phases of spots are given, those of the
 plane waves go on against what is missing.
+
+Of several colours each has plane waves of its own, and a cell takes the level that suits their sums best, the one where
+the real part of sum times conjugate light, added up over the colours, is largest. For one colour that is the level
+nearest to the phase.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, UInt8
 
+from doedesign.spots.shared_levels import best_levels
 from doedesign.spots.spots import Spots
 from fab.grid import Grid
 from fab.levels import nearest_around
@@ -28,8 +34,10 @@ class SpotLight(NamedTuple):
     """Light of spots: its sum, and how unequal it is.
 
     Attributes:
-        efficiency: share of the light on all spots; where their phases are given, in the wave that they make together.
-        uniformity_error: (max - min) / (max + min) of their light over their shares.
+        efficiency: share of the light on all spots, the mean of several colours; where their phases are given, in the
+            wave that they make together.
+        uniformity_error: (max - min) / (max + min) of their light over their shares; that of the worst colour, each by
+            itself, for every colour has a source of its own.
     """
 
     efficiency: float
@@ -40,15 +48,16 @@ class SpotLight(NamedTuple):
         return self.efficiency - uniformity * self.uniformity_error
 
 
-def spot_light(efficiencies: Float[np.ndarray, " m"], shares: Float[np.ndarray, " m"]) -> SpotLight:
-    """Sum and uniformity error of the light of spots that should have these shares."""
-    over = efficiencies / shares
-    return SpotLight(float(efficiencies.sum()), float((over.max() - over.min()) / max(over.max() + over.min(), 1e-300)))
+def spot_light(efficiencies: Float[np.ndarray, " m"], shares: Float[np.ndarray, " m"], colours: int = 1) -> SpotLight:
+    """Sum and uniformity error of the light of spots that should have these shares; of several colours, see `Spots`."""
+    over = (efficiencies / shares).reshape(colours, -1)
+    most, least = over.max(axis=1), over.min(axis=1)
+    return SpotLight(float(efficiencies.sum()), float(((most - least) / np.maximum(most + least, 1e-300)).max()))
 
 
 def judged(light: Complex[np.ndarray, " m"], spots: Spots) -> SpotLight:
     """Light of spots of these amplitudes, whose squares are efficiencies."""
-    found = spot_light(np.abs(light) ** 2, spots.shares)
+    found = spot_light(np.abs(light) ** 2, spots.shares, spots.colours)
     return found if spots.phases is None else found._replace(efficiency=spots.in_wave(light))
 
 
@@ -65,12 +74,17 @@ class WaveSet(NamedTuple):
 
     def improved(self, light: Complex[np.ndarray, "*start m"], spots: Spots) -> "WaveSet":
         """The next weights and phases, from the amplitudes of the spots that these ones gave."""
-        shares, gain = spots.shares, GAIN if spots.phases is None else GAIN_OF_GIVEN
-        size = np.abs(light)
+        gain = GAIN if spots.phases is None else GAIN_OF_GIVEN
+        # Every colour by itself: `[..., colour, spot]`.
+        by_colour = (*light.shape[:-1], spots.colours, -1)
+        shares = (spots.colours * spots.shares).reshape(spots.colours, -1)
+        size = np.abs(light).reshape(by_colour)
         size = np.maximum(size, 1e-9 * size.max(axis=-1, keepdims=True))
-        weights = self.weights * (np.sqrt(shares * np.sum(size**2, axis=-1, keepdims=True)) / size) ** gain
+        wanted = np.sqrt(shares * np.sum(size**2, axis=-1, keepdims=True))
+        weights = self.weights.reshape(by_colour) * (wanted / size) ** gain
+        weights = weights / (np.linalg.norm(weights, axis=-1, keepdims=True) * np.sqrt(spots.colours))
         phases = np.angle(light) if spots.phases is None else self.phases - gain * spots.phase_errors(light)
-        return WaveSet(weights / np.linalg.norm(weights, axis=-1, keepdims=True), phases)
+        return WaveSet(weights.reshape(light.shape), phases)
 
 
 class Staircase(NamedTuple):
@@ -98,8 +112,48 @@ class Staircase(NamedTuple):
         return self.nearest[np.searchsorted(self.edges, phase, side="right")]
 
 
+def shared_level(
+    fields: Sequence[Complex[np.ndarray, "*s"]], staircases: Sequence[Staircase]
+) -> UInt8[np.ndarray, "*s"]:
+    """The level that suits the fields of all colours best; of one colour that nearest to the phase.
+
+    Args:
+        fields: of every colour.
+        staircases: the levels as light of every colour sees them.
+    """
+    if len(fields) == 1:
+        return staircases[0].level(fields[0])
+    every = np.stack([np.asarray(field, np.complex64).ravel() for field in fields])
+    lights: Complex[np.ndarray, "colour level"] = np.stack([one.light for one in staircases])
+    found = best_levels(every, np.real(lights).copy(), np.imag(lights).copy())
+    return found.reshape(fields[0].shape)
+
+
+class _Designed:
+    """What is designed for spots: how levels follow from plane waves, and light from levels."""
+
+    spots: Spots
+
+    def level(self, waves: WaveSet) -> UInt8[np.ndarray, "y x"]:
+        """Level map of sums of plane waves."""
+        raise NotImplementedError
+
+    def amplitudes(self, level: UInt8[np.ndarray, "y x"]) -> Complex[np.ndarray, " m"]:
+        """Amplitude of every spot, its square an efficiency."""
+        raise NotImplementedError
+
+    def light(self, level: UInt8[np.ndarray, "y x"]) -> SpotLight:
+        """Sum and uniformity error of the spots' light."""
+        return judged(self.amplitudes(level), self.spots)
+
+    def step(self, waves: WaveSet) -> tuple[WaveSet, SpotLight]:
+        """The next plane waves, and the light of these."""
+        light = self.amplitudes(self.level(waves))
+        return waves.improved(light, self.spots), judged(light, self.spots)
+
+
 @dataclass(frozen=True, eq=False)
-class SpotProblem:
+class SpotProblem(_Designed):
     """A DOE to be designed for spots.
 
     Attributes:
@@ -127,10 +181,6 @@ class SpotProblem:
         grid = Grid((ny, nx), 2 * self.grid.pitch_m)
         return SpotProblem.on(grid, np.ones(grid.shape, np.float32), self.spots, self.staircase)
 
-    def light(self, level: UInt8[np.ndarray, "y x"]) -> SpotLight:
-        """Sum and uniformity error of the spots' light."""
-        return judged(self.amplitudes(level), self.spots)
-
     def level(self, waves: WaveSet) -> UInt8[np.ndarray, "y x"]:
         """Level map of a sum of plane waves."""
         return self.staircase.level(self.sums.superposition(waves.amplitudes))
@@ -140,7 +190,67 @@ class SpotProblem:
         field = self.coverage * self.staircase.light[level]
         return self.sums.amplitudes(field) / float(np.sum(self.coverage, dtype=np.float64))
 
-    def step(self, waves: WaveSet) -> tuple[WaveSet, SpotLight]:
-        """The next plane waves, and the light of these."""
-        light = self.amplitudes(self.level(waves))
-        return waves.improved(light, self.spots), judged(light, self.spots)
+    @property
+    def cell_waves(self) -> Complex[np.ndarray, "cell m"]:
+        """What a cell of unit light adds to the amplitude of every spot."""
+        sums = self.sums
+        waves = (sums.along_y[:, :, None] * sums.along_x[:, None, :]).reshape(self.spots.count, -1).T
+        waves = waves.astype(np.complex128) / float(np.sum(self.coverage, dtype=np.float64))
+        return waves * self.coverage.reshape(-1, 1)
+
+    @property
+    def level_light(self) -> Complex[np.ndarray, "level m"]:
+        """Transmission of every level for the light of every spot."""
+        return np.repeat(self.staircase.light.astype(np.complex128)[:, None], self.spots.count, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class SharedProblem(_Designed):
+    """A DOE to be designed for spots of several colours at once.
+
+    Its light is the mean of that of all colours, its uniformity error that of the worst one.
+
+    Attributes:
+        parts: the same cells and levels in the light of every colour.
+        spots: those of all colours.
+    """
+
+    parts: tuple[SpotProblem, ...]
+    spots: Spots
+
+    @classmethod
+    def of(cls, parts: Sequence[SpotProblem]) -> "SharedProblem":
+        """The problem of the parts of every colour."""
+        return cls(tuple(parts), Spots.joined([one.spots for one in parts]))
+
+    @property
+    def grid(self) -> Grid:
+        """The cells."""
+        return self.parts[0].grid
+
+    def coarser(self) -> "SharedProblem":
+        """As `SpotProblem.coarser`."""
+        return SharedProblem.of([one.coarser() for one in self.parts])
+
+    def level(self, waves: WaveSet) -> UInt8[np.ndarray, "y x"]:
+        """Level map of the sums of plane waves of all colours."""
+        amplitudes = waves.amplitudes
+        fields = [
+            one.sums.superposition(amplitudes[own]) * (one.coverage / one.coverage.mean())
+            for one, own in zip(self.parts, self.spots.of_colours, strict=True)
+        ]
+        return shared_level(fields, [one.staircase for one in self.parts])
+
+    def amplitudes(self, level: UInt8[np.ndarray, "y x"]) -> Complex[np.ndarray, " m"]:
+        """Amplitude of every spot; its square is an efficiency over the number of colours."""
+        return np.concatenate([one.amplitudes(level) for one in self.parts]) / np.sqrt(len(self.parts))
+
+    @property
+    def cell_waves(self) -> Complex[np.ndarray, "cell m"]:
+        """What a cell of unit light adds to the amplitude of every spot."""
+        return np.concatenate([one.cell_waves for one in self.parts], axis=1) / np.sqrt(len(self.parts))
+
+    @property
+    def level_light(self) -> Complex[np.ndarray, "level m"]:
+        """Transmission of every level for the light of every spot."""
+        return np.concatenate([one.level_light for one in self.parts], axis=1)

@@ -114,7 +114,8 @@ def _aims(names: Sequence[str], metrics: Sequence[Mapping[str, Any]]) -> TableBl
     for table in ("orders", "area", "focus"):
         found = [one.get(table) for one in metrics]
         own = [_worst(one) if isinstance(one, list) else one for one in found]
-        which = ", worst area" if any(isinstance(one, list) for one in found) else ""
+        one_of = "colour" if table == "orders" else "area"
+        which = f", worst {one_of}" if any(isinstance(one, list) for one in found) else ""
         if not all(isinstance(one, Mapping) for one in own):
             continue
         for key, value in own[0].items():  # type: ignore[union-attr]
@@ -124,11 +125,11 @@ def _aims(names: Sequence[str], metrics: Sequence[Mapping[str, Any]]) -> TableBl
     return TableBlock("What is aimed at", ("number", *_columns(names)), tuple(rows)) if rows else None
 
 
-def _worst(areas: Sequence[Mapping[str, Any]]) -> Mapping[str, float]:
-    """Numbers of the worst of several areas, each of its own."""
-    sides = {"on_target": min, "contrast": max, "zeroth_order": max}
-    shared = [key for key in sides if areas and all(key in one for one in areas)]
-    return {key: sides[key](one[key] for one in areas) for key in shared}
+def _worst(tables: Sequence[Mapping[str, Any]]) -> Mapping[str, float]:
+    """Numbers of the worst of several areas or colours, each of its own."""
+    sides = {"on_target": min, "uniformity_error": max, "contrast": max, "zeroth_order": max}
+    shared = [key for key in sides if tables and all(key in one for one in tables)]
+    return {key: sides[key](one[key] for one in tables) for key in shared}
 
 
 def _tolerances(names: Sequence[str], runs: Sequence[RunFiles]) -> TableBlock | None:

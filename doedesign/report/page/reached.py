@@ -57,17 +57,19 @@ def asked_block(files: RunFiles, metrics: Mapping[str, Any]) -> BarBlock | None:
 
 def _aims(metrics: Mapping[str, Any]) -> Iterator[Bar | None]:
     """Bars of spots, areas, foci and patterns."""
-    if orders := metrics.get("orders"):
+    tables = metrics.get("orders") or []
+    for orders in [tables] if isinstance(tables, Mapping) else tables:
+        where = f", {orders['colour']}" if "colour" in orders else ""
         ceiling = orders.get("ceiling")
         known: dict[str, Any] = {} if ceiling is None else {"mark": ceiling, "mark_text": f"ceiling {percent(ceiling)}"}
-        yield _bar("light on the spots", [orders["on_target"]], "on_target", **known)
+        yield _bar(f"light on the spots{where}", [orders["on_target"]], "on_target", **known)
         most = max(0.05, 1.2 * orders["uniformity_error"])
-        yield _bar("uniformity error", [orders["uniformity_error"]], "uniformity_error", end=most)
+        yield _bar(f"uniformity error{where}", [orders["uniformity_error"]], "uniformity_error", end=most)
         if orders.get("strongest_stray") is not None:
             each = orders["on_target"] / max(len(orders["spots"]), 1)
             given: dict[str, Any] = {"mark": each, "mark_text": f"mean spot {percent(each)}"}
             end = 1.2 * max(each, orders["strongest_stray"])
-            yield _bar("strongest stray order", [orders["strongest_stray"]], "on_target", end=end, **given)
+            yield _bar(f"strongest stray order{where}", [orders["strongest_stray"]], "on_target", end=end, **given)
     areas = metrics.get("area") or []
     for area in [areas] if isinstance(areas, Mapping) else areas:
         where = "" if "distance_m" not in area else f", {area['colour']}, {length(area['distance_m'])}"
@@ -163,7 +165,8 @@ def _orders_zeroth(files: RunFiles, metrics: Mapping[str, Any], tolerance: Mappi
         return None
     end = min(1.0, 1.25 * max(max(bar.value, bar.high or 0.0) for bar in there)) or 1.0
     note = "The share of the light that passes as if the plate were flat, over the colours."
-    wanted = (metrics.get("orders") or {}).get("zeroth_order_wanted")
+    orders = metrics.get("orders") or {}
+    wanted = any(one.get("zeroth_order_wanted") for one in (orders if isinstance(orders, list) else [orders]))
     return BarBlock(
         f"0th order ({ONE_OF_THE_SPOTS})" if wanted else "0th order",
         tuple(bar._replace(end=end) for bar in there),

@@ -10,7 +10,18 @@ from pydantic import Field, field_validator
 
 from doedesign.spec.targets.arrangements import grid_orders, hexagonal_places, ring_places
 from doedesign.spec.targets.beside import beside_problems, in_focus
-from doedesign.spec.values import PLACE, Count, NotNegative, Positive, bounded, broken, length, place
+from doedesign.spec.values import (
+    PLACE,
+    ColourName,
+    Count,
+    NotNegative,
+    Positive,
+    bounded,
+    broken,
+    length,
+    nearest,
+    place,
+)
 from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.aperture import MaskAperture, RoundAperture
 from fab.errors import InputError
@@ -54,6 +65,9 @@ class SpotsSpec(SpecTable, frozen=True):
         uniformity_as_fabricated: the same of plates with the errors of the process, for a unit cell: cells are
             exchanged for spots that stay equal on these (`doedesign.spots.plates`). 0 looks at the plate as drawn.
         starts: random starts of the search for the spots' phases, where these are free.
+        colours: names of the colour channels that should get these spots, all alike; the first if left out. A relief of
+            several waves parts colours better. Orders of a unit cell are the same for all, and so lie wavelength /
+            period apart; other spots lie in the same places.
     """
 
     angles: ClassVar = dict.fromkeys(("spacing_m", "radius_m", "places_m", "offset_m"), PLACE)
@@ -74,6 +88,7 @@ class SpotsSpec(SpecTable, frozen=True):
     uniformity: NotNegative = optional(1.0)
     uniformity_as_fabricated: NotNegative = optional(0.0)
     starts: Annotated[int, Field(strict=True, ge=1, le=100_000)] = optional(200)
+    colours: tuple[ColourName, ...] = optional((), example='["638nm", "520nm"]')
 
     @field_validator("count")
     @classmethod
@@ -128,6 +143,9 @@ def spot_problems(spec: "Spec") -> Iterator[InputError]:
     for problem in _keys(spec):
         complete = False
         yield problem
+    for problem in _colours(spec):
+        complete = False
+        yield problem
     yield from _as_fabricated(spec)
     yield from beside_problems(spec, "spots")
     yield from in_focus(spec)
@@ -149,6 +167,28 @@ def _keys(spec: "Spec") -> Iterator[InputError]:
         yield InputError("spots.offset", "orders of a unit cell cannot be moved", "an offset", "Remove it.")
 
 
+def _colours(spec: "Spec") -> Iterator[InputError]:
+    """Rules of the colours that should get spots."""
+    spots: Any = spec.spots
+    known = [colour.name for colour in spec.optics.colours]
+    for name in spots.colours:
+        if name not in known:
+            rule, cure = "must be colour channels of the spec", nearest(name, known)
+            yield InputError("spots.colours", rule, f'"{name}"', cure)
+    if len(set(spots.colours)) < len(spots.colours):
+        yield InputError("spots.colours", "each colour is named once", "one twice", "Remove the second.")
+    if len(spots.colours) > 1 and spots.phases_rad:
+        rule, cure = "phases of spots of several colours must be free", "Leave it out, or name one colour."
+        yield InputError("spots.phases", rule, "phases", cure)
+
+
+def _wavelengths_m(spec: "Spec") -> list[float]:
+    """Wavelengths that spots are designed for."""
+    assert spec.spots is not None
+    first = {colour.name: colour.wavelengths_m[0] for colour in spec.optics.colours}
+    return [first[name] for name in spec.spots.colours] or [next(iter(first.values()))]
+
+
 def _as_fabricated(spec: "Spec") -> Iterator[InputError]:
     """Rules of spots that stay equal on plates as fabricated."""
     spots: Any = spec.spots
@@ -160,6 +200,9 @@ def _as_fabricated(spec: "Spec") -> Iterator[InputError]:
         return
     if spots.phases_rad:
         yield InputError(key, "phases of spots must be free", "spots.phases", "Leave one of them out.")
+    if len(spots.colours) > 1:
+        rule, got = "plates are looked at in one colour", f"{len(spots.colours)} colours"
+        yield InputError(key, rule, got, "Name one in spots.colours, or leave it out.")
     side = round(spots.period_m / spec.doe.pitch_m)
     cells = side ** sum(count > 1 for count in spots.count)
     if cells > MOST_CELLS:
@@ -176,7 +219,8 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
     if len(spots.phases_rad) not in (0, count):
         got = f"{len(spots.phases_rad)}"
         yield InputError("spots.phases", f"must be one per spot, {count}", got, "Add or remove phases.")
-    wavelength, pitch = spec.optics.colours[0].wavelengths_m[0], spec.doe.pitch_m
+    # The shortest wavelength is steered least.
+    wavelength, pitch = min(_wavelengths_m(spec)), spec.doe.pitch_m
     most = wavelength / (2 * pitch)  # the direction sine at which a grating of two cells sends light
     if spots.period_m is not None:
         cells = spots.period_m / pitch
@@ -261,12 +305,12 @@ def open_periods(cells: Bool[np.ndarray, "y x"], period: tuple[int, int]) -> Boo
 def _apart(spec: "Spec") -> Iterator[InputError]:
     """The rule that spots lie apart far enough for their efficiencies to be shares of the light (`LEAST_WIDTHS`).
 
-    A grating sends every wavelength so many spot widths far, so that the first one speaks for all.
+    A grating sends every wavelength so many spot widths far; where places are given, the longest has the widest spots.
     """
     from scipy.spatial import KDTree  # not needed to read a spec without spots
 
     spots: Any = spec.spots
-    wavelength, distance = spec.optics.colours[0].wavelengths_m[0], spec.image_distance_m
+    wavelength, distance = max(_wavelengths_m(spec)), spec.image_distance_m
     places = places_of(spots) + np.array(spots.offset_m[::-1])
     sines = np.stack(sines_at(spec.optics.mapping, spec.optics.distortion, *(places / distance).T), axis=1)
     if not np.isfinite(sines).all():
