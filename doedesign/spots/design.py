@@ -33,6 +33,8 @@ _FEW_LEVELS = 4
 _TRIED, _TRIAL_STEPS = 4, 30  # candidates of the search, and steps with each before one is chosen
 _SWEEPS, _OFFERS = 100, 2**20  # over such a cell: at least, and as many as make so many offers
 _HEATS = (3e-5, 2.5e-4)  # of exchanges of which the best is taken
+# The same for several colours, whose plane waves leave spots less equal: heat loses more light than it finds.
+_SHARED_HEATS, _SHARED_OFFERS = (0.0, 3e-6), 2**22
 _NARROWEST = 32  # cells of a row at which random starts of an exchange begin
 # For plates as fabricated: how many are looked at to choose starts, and to exchange cells; starts tried, and finished;
 # offers to the cells of each of either; heat; starts that are raised by every number of levels.
@@ -163,9 +165,11 @@ class SpotTask:
         problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
         if level.size > MOST_CELLS:
             return level
-        sweeps = max(_SWEEPS, _OFFERS // level.size)
+        shared = isinstance(problem, SharedProblem)
+        heats, most = (_SHARED_HEATS, _SHARED_OFFERS) if shared else (_HEATS, _OFFERS)
+        sweeps = max(_SWEEPS, most // level.size)
         # Merit counts uniformity as often as its weight says, and so does heat.
-        heats = [heat * (1 + uniformity) for heat in _HEATS]
+        heats = [heat * (1 + uniformity) for heat in heats]
         # An exchange has a smooth measure of its own of how equal spots are, so it may spoil the one that is asked for.
         found = [level]
         found += [
