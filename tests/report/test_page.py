@@ -498,6 +498,10 @@ def test_a_run_at_work_shows_its_loss(run: Path, tmp_path: Path):
     assert names(content)[0] == "history"
     assert "at work" in content.summary[0]
     assert len(blocks(content, ChartBlock)[0].x) >= 2
+    # Of one colour, one near and one far depth every step sees all, so that there is no jump to explain.
+    assert blocks(content, ChartBlock)[0].note == ""
+    terms = next(block for block in blocks(content, TableBlock) if block.title == "Objectives")
+    assert terms.note == "Values without weights."
     pages = watch_report(folder, out=tmp_path / "live.html", every_s=0.01)
     first = next(pages).read_bytes()
     assert b"at work" in first

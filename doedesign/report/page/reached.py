@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from doedesign.report.history import history_note
 from doedesign.report.page.blocks import Bar, BarBlock, PageSection, TableBlock, section
 from doedesign.report.page.files import RunFiles, digest_of, listed_json
 from doedesign.report.page.numbers import SHARES, label_of, length, number, percent, value_of
@@ -222,5 +223,5 @@ def _terms(files: RunFiles, history: Rows) -> TableBlock | None:
     )
     rows += (("loss", "", number(first["loss"]), number(last["loss"])),)
     head = ("objective", "weight", f"step {first['step'] + 1}", f"step {last['step'] + 1}")
-    note = "Values without weights; every step looks at some depths and colours, so they jump."
+    note = f"Values without weights. {history_note(files.spec)}".rstrip()
     return TableBlock("Objectives", head, rows, note, folded=True)
