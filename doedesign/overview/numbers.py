@@ -128,7 +128,7 @@ def _of_run(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
             yield MainNumber(
                 f"{key}_rigorous", f"{label} by Maxwell's equations", _percent(finest[key]), "%", side, note
             )
-    for name in ("orders", "area", "areas", "focus"):
+    for name in ("orders", "area", "focus"):
         if name in metrics:
             yield from _of_aim(metrics[name], _zeroth_note(metrics))
             return
