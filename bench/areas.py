@@ -86,7 +86,6 @@ def mraf(design: Design, seconds: float, mix: float, quadratic: bool) -> np.ndar
     cells = grid.shape[0] * pad
     at = np.fft.fftfreq(cells, grid.pitch_m) * scale
     inside = (np.abs(at[:, None]) <= 0.5e-3) & (np.abs(at) <= 0.5e-3)
-    near = (np.abs(at[:, None]) <= 0.6e-3) & (np.abs(at) <= 0.6e-3)
     square = grid.axis_m("y")[:, None] ** 2 + grid.axis_m("x") ** 2
     open_ = square <= (design.camera.aperture_m / 2) ** 2
     rng = np.random.default_rng(0)
@@ -99,7 +98,7 @@ def mraf(design: Design, seconds: float, mix: float, quadratic: bool) -> np.ndar
         far = np.fft.fft2(open_ * np.exp(1j * phase), (cells, cells))
         wanted = mix * inside * amplitude * np.exp(1j * np.angle(far))
         if mix < 1:
-            wanted = np.where(near & inside, wanted, (1 - mix) * far)
+            wanted = np.where(inside, wanted, (1 - mix) * far)
         phase = np.angle(np.fft.ifft2(wanted)[: grid.shape[0], : grid.shape[1]])
     levels = design.levels.count
     return np.exp(2j * np.pi / levels * np.rint(phase * levels / (2 * np.pi)))

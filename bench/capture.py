@@ -16,7 +16,6 @@ depths, from arrays to array, in a process of its own whose peak memory is print
 """
 
 import argparse
-import resource
 import subprocess
 import sys
 import time
@@ -28,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bench.psf import time_rounds
+from doedesign.runtime.memory import peak_bytes
 from sim.imaging.convolve import fast_length
 from sim.imaging.formation import Optics, capture, shadow_px
 from sim.imaging.occlusion import Model
@@ -128,7 +128,7 @@ def one_frame(model: Model) -> None:
     begun = time.perf_counter()
     capture_frame(scene, optics, model)
     took = time.perf_counter() - begun
-    print(took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2)
+    print(took, peak_bytes() / 1e9)
 
 
 def report_frame() -> None:

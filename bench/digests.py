@@ -6,9 +6,10 @@
 
 The session runs the command line only: the quick example, its mask order, PSFs, plates as fabricated, a tolerance
 study, captures and two training steps; and the small order of `masks/example`. Digests hold on one machine: another
-processor rounds differently.
+processor rounds differently. Where a command fails there are none, for files that are missing twice are no proof.
 """
 
+import argparse
 import hashlib
 import json
 import subprocess
@@ -22,7 +23,11 @@ TRAINING = ["train.size=64", "train.steps=2", "train.perceptual=0.0", "network.w
 
 
 def session(folder: Path) -> None:
-    """Run every command that writes results into a folder."""
+    """Run every command that writes results into a folder.
+
+    Raises:
+        SystemExit: one of them failed.
+    """
     bare = str(next((ROOT / "masks" / "example").glob("*_HEIGHT.npy")))
     quick = str(ROOT / "examples" / "quick.toml")
     run, small = str(folder / "quick"), str(folder / "example")
@@ -49,6 +54,7 @@ def session(folder: Path) -> None:
         print(f"{done.returncode} doedesign {' '.join(command)}".replace(str(folder), "."), file=sys.stderr)
         if done.returncode:
             print(done.stderr, file=sys.stderr)
+            raise SystemExit(1)
 
 
 def _pictures(folder: Path) -> str:
@@ -80,9 +86,21 @@ def compare(before: dict[str, str], after: dict[str, str]) -> list[str]:
     return [name for name in sorted({*before, *after}) if before.get(name) != after.get(name)]
 
 
-if __name__ == "__main__":
-    if sys.argv[1] == "--compare":
-        differences = compare(*(json.loads(Path(name).read_text()) for name in sys.argv[2:4]))
+def main() -> int:
+    """Write the digests of this state, or compare those of two; return 1 if they differ."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("file", type=Path, nargs="?", help="file for the digests of this state")
+    parser.add_argument("--compare", type=Path, nargs=2, metavar=("BEFORE", "AFTER"), help="two such files")
+    given = parser.parse_args()
+    if (given.file is None) == (given.compare is None):
+        parser.error("give a file for the digests, or two such files with --compare")
+    if given.compare is not None:
+        differences = compare(*(json.loads(path.read_text()) for path in given.compare))
         print("\n".join(differences) or "every file is the same")
-        sys.exit(bool(differences))
-    Path(sys.argv[1]).write_text(json.dumps(digests(), indent=1, sort_keys=True) + "\n")
+        return int(bool(differences))
+    given.file.write_text(json.dumps(digests(), indent=1, sort_keys=True) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

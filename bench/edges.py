@@ -3,9 +3,9 @@
     python -m bench.edges            N = 2400, about a minute
     python -m bench.edges --quick    N = 600
 
-The plate of the automotive design's size with random levels, one colour, a far source and one at 5 cm; heights change
-from call to call, so that walls are computed every time. Methods take turns, and a ratio is the median of the ratios
-within rounds.
+The plate of the automotive design's size with random levels, one colour, a far source and one at 5 cm; heights are an
+argument of what is compiled, so that walls are computed every time. Methods take turns, and a ratio is the median of
+the ratios within rounds.
 """
 
 import argparse

@@ -10,7 +10,6 @@ Memory and whole orders are measured in a process of their own.
 
 import argparse
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from doedesign.runtime.memory import peak_bytes
 from fab.gds.oasis import write_oasis
 from fab.gds.writer import write_gds
 from fab.grid import Grid
@@ -180,7 +180,7 @@ def run_task(task: str, kind: str, count: int) -> None:
     """Run a task and print its peak memory, JSON."""
     with tempfile.TemporaryDirectory() as name:
         {"peak": task_peak, "order": task_order}[task](kind, count, Path(name))
-    print(json.dumps({"peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9}))
+    print(json.dumps({"peak_gb": peak_bytes() / 1e9}))
 
 
 def row(what: str, value: float, unit: str, target: str, met: bool | None) -> None:

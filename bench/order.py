@@ -9,7 +9,6 @@ ones, the maps a wrapped cone with noise (like the automotive plate) for a conta
 """
 
 import argparse
-import resource
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,7 @@ import numpy as np
 from bench.masks import bench_map
 from bench.reference import wrapped_map
 from doedesign.build import process_from_spec
+from doedesign.runtime.memory import peak_bytes
 from doedesign.spec.process import ProcessSpec
 from fab.grid import Grid
 from fab.level_map import LevelMap
@@ -101,7 +101,7 @@ def main() -> None:
             write(given.write, given.cells, given.folder)
         else:
             verify(given.folder).require()
-        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2)
+        print(peak_bytes() / 1e9)
         return
     if not given.quick:
         print(f"Mask order, {PLATE} x {PLATE} pixels, 16 levels, usual formats, everything proved")

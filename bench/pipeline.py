@@ -55,8 +55,9 @@ def parts(rounds: int) -> None:
     """Print what an item is made of, on one thread."""
     picture, rng = read_display(sample_files()[0]), np.random.default_rng(0)
     background = linear_light(crop(picture, SHAPE, (0.5, 0.5)))
+    height, width = picture.shape[:2]
     calls: dict[str, Callable[[], object]] = {
-        "decode a PNG of 741 x 497": lambda: read_display(sample_files()[0]),
+        f"decode a PNG of {width} x {height}": lambda: read_display(sample_files()[0]),
         "crop and linear light": lambda: linear_light(crop(picture, SHAPE, (0.5, 0.5))),
         "draw dirt": lambda: Dirt().draw(rng, VIEW, background),
         "draw raindrops": lambda: Raindrop().draw(rng, VIEW, background),

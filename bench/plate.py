@@ -11,7 +11,6 @@ their rates leave out the start.
 """
 
 import argparse
-import resource
 import subprocess
 import sys
 import time
@@ -25,6 +24,7 @@ from bench.reference import wrapped_map
 from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.design.design import Design
 from doedesign.prediction import predict
+from doedesign.runtime.memory import peak_bytes
 from doedesign.runtime.pool import evaluate_here
 from doedesign.spec import load_spec
 from doedesign.tolerancing.pool import DrawModel, predicted_rows
@@ -67,7 +67,7 @@ def time_draws(design: Design, process: Process, rounds: int) -> None:
             draw_s.append(middle - start)
             bank_s.append(end - middle)
             ratios.append(draw_s[-1] / bank_s[-1])
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    peak = peak_bytes() / 1e9
     ratio, cells = float(np.median(ratios)), design.camera.grid.shape[0]
     print(f"Plate as fabricated, N = {cells}, 16 levels, 3 colours, 2 depths, every error of a contact aligner")
     print(f"  light: {design.camera.light}")

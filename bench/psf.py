@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.reference import YELLOW_M, make_camera, oversampled_psf, relative_error, wrapped_map
+from doedesign.runtime.memory import peak_bytes
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 
@@ -185,28 +186,22 @@ def time_rounds(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, N
     return {name: np.array(values) for name, values in seconds.items()}
 
 
-def high_water_mb() -> float:
-    """Return the peak resident memory of this process, in 10^6 bytes; `getrusage` would start from its parent's."""
-    line = next(text for text in Path("/proc/self/status").read_text().splitlines() if text.startswith("VmHWM"))
-    return int(line.split()[1]) * 1024 / 1e6
-
-
 def report_peak(name: str, cells: int, folder: Path) -> None:
     """Print the growth of this process's peak over three calls, in MB; inputs are read from `folder`."""
     build = METHODS[name][1]
     tiny = build(make_task(64))
     tiny.forward()
     tiny.gradient()
-    before = high_water_mb()
+    before = peak_bytes() / 1e6
     arrays = [np.load(folder / f"{part}.npy", allow_pickle=False) for part in ("height", "coverage", "weights")]
     method = build(Task(make_camera(cells, 4e-3, 8e-3, 1.85e-6, 512), *arrays))
     del arrays
     for _ in range(3):
         method.forward()
-    forward = high_water_mb() - before
+    forward = peak_bytes() / 1e6 - before
     for _ in range(3):
         method.gradient()
-    print(f"{forward:.0f} {high_water_mb() - before:.0f}")
+    print(f"{forward:.0f} {peak_bytes() / 1e6 - before:.0f}")
 
 
 def measure_peaks(task: Task) -> dict[str, tuple[float, float]]:

@@ -8,7 +8,6 @@ level map every so many steps; what that takes is part of the steps. A step look
 """
 
 import argparse
-import resource
 import time
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import numpy as np
 from doedesign.design.optimize import finished_design, initial_state, make_update, optimiser_of, step_inputs
 from doedesign.design.problem import problem_of
 from doedesign.design.robust import ROUND, RobustTask
+from doedesign.runtime.memory import peak_bytes
 from doedesign.spec import load_spec
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -46,7 +46,7 @@ def main() -> None:
     for _ in task.steps(begun, 0):
         ends.append(time.perf_counter())
     robust = (ends[2 * ROUND - 1] - ends[ROUND - 1]) / ROUND  # the second round; the first one compiles
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    peak = peak_bytes() / 1e9
     ratio = robust / plain
     print(f"Robust step with 4 plates, {spec.name}, {problem.camera.grid.shape[0]} cells per side, 3 colours")
     print(f"  plain step {plain * 1e3:8.0f} ms    robust step {robust * 1e3:8.0f} ms")

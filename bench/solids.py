@@ -8,7 +8,6 @@ counted; files are forced to the disk, as in use.
 """
 
 import argparse
-import resource
 import subprocess
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from bench.masks import bench_map
+from doedesign.runtime.memory import peak_bytes
 from fab.aperture import RoundAperture
 from fab.solids.columns import Columns, reduced_cells, whole, window_cells
 from fab.solids.mesh import closed_volume_m3, relief_mesh
@@ -102,7 +102,7 @@ def bench_case(case: str, quick: bool) -> None:
             else:
                 cells = window_cells(level_map, whole(level_map.grid))
             bench_mesh(case, cells, folder)
-    print(f"    peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2:.2f} GB", flush=True)
+    print(f"    peak {peak_bytes() / 1e9:.2f} GB", flush=True)
 
 
 def main() -> int:

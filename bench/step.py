@@ -4,7 +4,6 @@ Three colours, near and far, forward and back: 3 x 2 x 2 transforms of 2400 x 24
 step. Both are timed alternately in one process; the table gives the median of the ratios of neighbouring rounds.
 """
 
-import resource
 import time
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from doedesign.design.optimize import initial_state, make_update, optimiser_of, step_inputs
 from doedesign.design.problem import problem_of
+from doedesign.runtime.memory import peak_bytes
 from doedesign.spec import load_spec
 
 SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"
@@ -41,7 +41,7 @@ def main(rounds: int = 9) -> None:
             step_s.append(middle - start)
             floor_s.append(end - middle)
             ratios.append(step_s[-1] / floor_s[-1])
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    peak = peak_bytes() / 1e9
     ratio = float(np.median(ratios))
     print("Optimisation step, automotive, N = 2400, 3 colours x near and far, 16 levels, with gradient and Adam")
     print(f"  step {np.median(step_s) * 1e3:8.0f} ms    12 bare FFTs {np.median(floor_s) * 1e3:8.0f} ms")

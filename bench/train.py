@@ -39,12 +39,12 @@ import numpy as np
 import doedesign.recon.blocks as blocks
 import doedesign.recon.network as layers
 from bench.capture import make_psf, verdict
-from bench.psf import high_water_mb
 from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec
 from doedesign.capture.scenes import Batch, NamedScene
 from doedesign.recon.conv import convolution
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.tiles import reconstruct_tiled
+from doedesign.runtime.memory import peak_bytes
 from doedesign.spec import Spec, load_spec
 from doedesign.training.checkpoint import settled
 from doedesign.training.distance.backbones import convolutions, weight_shapes
@@ -274,7 +274,7 @@ def one_step(name: str, rounds: int = 3) -> None:
     """Print seconds and gigabytes of steps."""
     step = stepping(spec_of(name))
     step()
-    print(np.median([clocked(step)[0] for _ in range(rounds)]), high_water_mb() / 1000)
+    print(np.median([clocked(step)[0] for _ in range(rounds)]), peak_bytes() / 1e9)
 
 
 def one_frame() -> None:
@@ -283,7 +283,7 @@ def one_frame() -> None:
     frame = np.random.default_rng(0).random((3, *FRAME), np.float32)
     far, near = make_psf(0, (2, 3, 513, 513))
     took, _ = clocked(lambda: reconstruct_tiled(network, frame, far, near))
-    print(took, high_water_mb() / 1000)
+    print(took, peak_bytes() / 1e9)
 
 
 def report_lpips(rounds: int = 9) -> None:

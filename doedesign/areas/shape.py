@@ -15,6 +15,7 @@ from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, colour_n
 from doedesign.design.design import Design
 from doedesign.design.given_wave import WaveShare
 from doedesign.spec import input_files
+from doedesign.spec.targets.areas import WITHIN_THE_AREA
 from fab.units import MICROMETRES, MILLIMETRES, PlaceUnit, format_length
 from sim.camera import Camera
 from sim.metrics import zeroth_order
@@ -149,6 +150,7 @@ class AreaTable:
             "contrast": self.contrast,
             "pixel_contrast": self.pixel_contrast,
             "zeroth_order": self.zeroth_order,
+            "zeroth_order_wanted": self.zeroth_order_wanted,
             "side_lobe": self.side_lobe,
             **sizes,
             **edges,
@@ -163,14 +165,19 @@ class AreaTable:
         return {"on_target": self.efficiency, "contrast": self.contrast}
 
     @property
-    def zeroth_order_note(self) -> str:
-        """Words after the 0th order where light goes straight on into the area, whose own light there is part of it."""
+    def zeroth_order_wanted(self) -> bool:
+        """Whether light goes straight on into the area, whose own light there is part of the 0th order."""
         at = []
         for axis, sine in zip((self.target.sines_y, self.target.sines_x), self.camera.moved_sines(), strict=True):
             if not axis[0] <= sine <= axis[-1]:
-                return ""
+                return False
             at.append(int(np.abs(axis - sine).argmin()))
-        return " (within the area)" if self.target.lit[at[0], at[1]] else ""
+        return bool(self.target.lit[at[0], at[1]])
+
+    @property
+    def zeroth_order_note(self) -> str:
+        """Words after the 0th order where it is wanted."""
+        return f" ({WITHIN_THE_AREA})" if self.zeroth_order_wanted else ""
 
     def describe(self) -> str:
         """One line."""

@@ -27,6 +27,7 @@ def new(name: str | None = None, *, out: Path | None = None, json_: AsJson = Fal
     from fab.files import write_atomic
 
     if name is None:
+        refuse_options(new, {"out": out}, "goes with the name of a template only", "Name one: doedesign new splitter.")
         names = template_names()
         if json_:
             print_text(json.dumps({each: template_summary(each) for each in names}))

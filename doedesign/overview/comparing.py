@@ -137,7 +137,8 @@ def _differing(folders: Sequence[Path]) -> Iterator[ComparedKey]:
     tables = [{key.rpartition(".")[0] for key in each} for each in texts]
     partial = {table for each in tables for table in each if not all(table in other for other in tables)}
     for table in sorted(partial):
-        yield ComparedKey(f"[{table}]", tuple("there" if table in each else None for each in tables))
+        shown = table if table.endswith("]") else f"[{table}]"
+        yield ComparedKey(shown, tuple("there" if table in each else None for each in tables))
     for key in dict.fromkeys(key for each in texts for key in each):
         values = tuple(each.get(key) for each in texts)
         if key.rpartition(".")[0] not in partial and any(value != values[0] for value in values):
@@ -152,7 +153,7 @@ def _keys_of(text: str) -> dict[str, str]:
             table = line.strip("[]")
             if line.startswith("[["):
                 counts[table] += 1
-                table = f"{table}[{counts[table]}]"
+                table = f"{table}[{counts[table] - 1}]"  # as `--set` and messages count
         elif " = " in line and not line.startswith("#"):
             key, _, value = line.partition(" = ")
             found[f"{table}.{key}".removeprefix(".")] = value

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from doedesign.overview.kinds import TABLE_NAME, Record
+from doedesign.spec.targets.areas import WITHIN_THE_AREA
 from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
 from fab.errors import InputError
 from fab.files import read_json
@@ -103,13 +104,26 @@ def _percent(share: Any) -> float | None:
     return None if share is None else 100 * float(share)
 
 
-def _zeroth_note(metrics: Mapping[str, Any]) -> str:
-    """The note on the 0th order of spots: whether it is one of them."""
-    orders = metrics.get("orders") or {}
-    # Of plates as drawn and as made, of several colours a list.
-    found = [orders, *orders.values()] if isinstance(orders, dict) else [orders]
-    tables = [one for part in found for one in (part if isinstance(part, list) else [part]) if isinstance(one, dict)]
-    return ONE_OF_THE_SPOTS if any(table.get("zeroth_order_wanted") for table in tables) else ""
+def zeroth_note(metrics: Mapping[str, Any]) -> str:
+    """The note on a 0th order that is wanted: one of the spots, or light of the area, of several areas of each.
+
+    Args:
+        metrics: of a run or of a plate.
+    """
+    for name, note in (("orders", ONE_OF_THE_SPOTS), ("area", WITHIN_THE_AREA)):
+        tables = _tables_in(metrics.get(name))
+        if tables and all(table.get("zeroth_order_wanted") for table in tables):
+            return note
+    return ""
+
+
+def _tables_in(found: Any) -> list[Mapping[str, Any]]:
+    """Tables of spots or areas: a plate has one as drawn and one as fabricated, several areas one each."""
+    if isinstance(found, Mapping) and "on_target" not in found:
+        return [table for one in found.values() for table in _tables_in(one)]
+    if isinstance(found, list):
+        return [table for one in found for table in _tables_in(one)]
+    return [found] if isinstance(found, Mapping) else []
 
 
 _REFINED: tuple[tuple[str, str, Literal["high", "low"]], ...] = (
@@ -125,14 +139,14 @@ def _of_run(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
     if rigorous:
         finest = max(rigorous, key=lambda row: row["terms"])
         for key, label, better in _REFINED:
-            note = _zeroth_note(metrics) if label == "0th order" else ""
+            note = zeroth_note(metrics) if label == "0th order" else ""
             side = None if note else better
             yield MainNumber(
                 f"{key}_rigorous", f"{label} by Maxwell's equations", _percent(finest[key]), "%", side, note
             )
-    for name in ("orders", "area", "areas", "focus"):
+    for name in ("orders", "area", "focus"):
         if name in metrics:
-            yield from _of_aim(metrics[name], _zeroth_note(metrics))
+            yield from _of_aim(metrics[name], zeroth_note(metrics))
             return
     rows = metrics["psf"]
     near = [row for row in rows if "concentration" in row]
@@ -168,9 +182,10 @@ def _of_aim(found: Any, note: str = "") -> Iterator[MainNumber]:
         yield MainNumber("focus_width", "width of the worst focus over that wanted", one["focus_width"], "", "low")
     for key in ("zeroth_order", "zeroth_order_efficiency"):
         if key in one:
-            # A spot or a focus of its own may be wanted there, but no area.
-            wanted = None if "foci" in one or "spots" in one else "low"
-            share = _percent(max(each[key] for each in tables))
+            # A spot or a focus of its own may be wanted there; of several areas those count where it is not.
+            wanted = None if "foci" in one or "spots" in one or note else "low"
+            leaked = [each for each in tables if not each.get("zeroth_order_wanted")] or tables
+            share = _percent(max(each[key] for each in leaked))
             yield MainNumber(key, "0th order", share, "%", wanted, note)
     if one.get("ceiling") is not None:
         yield MainNumber("ceiling", "ceiling of light on target", _percent(one["ceiling"]), "%")
@@ -196,7 +211,7 @@ def _of_plate(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
     rows = metrics["fabricated"]
     yield from _of_plates({name: _mean(rows, partial(_get, name)) for name, *_ in _ON_PLATES})
     order = _percent(_mean(rows, lambda row: row["zeroth_order"]))
-    yield MainNumber("zeroth_order", "0th order", order, "%", note=_zeroth_note(metrics))
+    yield MainNumber("zeroth_order", "0th order", order, "%", note=zeroth_note(metrics))
     inside = _percent(_mean(rows, lambda row: row["throughput"]))
     yield MainNumber("throughput", "light in the window", inside, "%", "high")
 
@@ -220,7 +235,7 @@ def _note_of_run(folder: Path) -> str:
     """The note on the 0th order of the run that a study is of, whose folder it is in or beside; none elsewhere."""
     for path in (folder / METRICS_FILE, folder.parent / METRICS_FILE):
         if path.is_file():
-            return _zeroth_note(read_json(path))
+            return zeroth_note(read_json(path))
     return ""
 
 

@@ -176,8 +176,8 @@ _AIMED = {
     "zeroth_order_wanted": ResultNumber(
         "yes or no",
         "true or false",
-        "whether a spot lies where light goes straight on, so that the 0th order is one of the spots and no leakage",
-        "doedesign.spots.orders.OrderTable",
+        "whether a spot or an area lies where light goes straight on, so that the 0th order is wanted and no leakage",
+        "doedesign.spots.orders.OrderTable, doedesign.areas.shape.AreaTable",
     ),
     "strongest_stray": ResultNumber(
         "share",

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 from doedesign import __version__
 from doedesign.runs.folder import COST_NAME, FORMAT
+from doedesign.runtime.memory import peak_bytes
 from doedesign.runtime.progress import duration_text
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, read_json
@@ -117,13 +118,12 @@ def measured(run: Path | None, command: str, *, writes: Path | None = None) -> I
         ended = "stopped"
         raise
     finally:
-        usage = [resource.getrusage(who).ru_maxrss * _KIB for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         measuring.cost = Cost(
             (command,),
             round(time.monotonic() - start, 3),
             round(_cpu_s() - cpu, 3),
-            usage[0],
-            usage[1],
+            peak_bytes(),
+            resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * _KIB,
             platform.node(),
             cores(),
             datetime.now(UTC).isoformat(timespec="seconds"),

@@ -358,6 +358,7 @@ def test_a_0th_order_within_the_area_is_told_as_that(tmp_path: Path, changes: li
     assert table.zeroth_order == pytest.approx(1, abs=1e-6)  # flat glass
     note = " (within the area)" if inside else ""
     assert f"0th order 100.000 %{note}; Fresnel" in table.describe()
+    assert table.summary()["zeroth_order_wanted"] is inside
 
 
 def test_a_picture_is_drawn_upright(tmp_path: Path):

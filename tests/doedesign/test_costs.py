@@ -3,8 +3,11 @@
 import json
 import math
 import platform
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from doedesign.runs.costs import Cost, costs_of, elapsed_text, measured, together
@@ -49,6 +52,15 @@ def test_a_run_that_was_stopped_and_resumed_adds_up(tmp_path: Path):
     assert whole is not None
     assert whole.seconds == pytest.approx(sum(one.seconds for one in costs))
     assert whole.commands == ("optimize", "optimize")
+
+
+def test_the_memory_of_who_starts_a_command_is_not_its_own():
+    held = np.ones(100_000_000)
+    code = (
+        "from doedesign.runs.costs import measured\nwith measured(None, 'psf') as it: pass\nprint(it.cost.peak_bytes)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 0 < int(done.stdout) < 0.9 * held.nbytes
 
 
 def test_nothing_is_kept_of_nothing(tmp_path: Path):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -284,7 +285,7 @@ def test_two_runs_side_by_side(tmp_path: Path):
 def test_a_table_that_one_spec_lacks_is_one_difference(tmp_path: Path):
     fewer = SPEC.replace('[[limit]]\nquantity = "strehl"\nmin = 0.9\n', "")
     found = compare_results([written(tmp_path / "a"), written(tmp_path / "b", spec=fewer)])
-    assert [(one.key, one.values) for one in found.keys] == [("[limit[1]]", ("there", None))]
+    assert [(one.key, one.values) for one in found.keys] == [("limit[0]", ("there", None))]  # counted as by `--set`
 
 
 def test_damaged_results_are_not_compared(tmp_path: Path):
@@ -407,6 +408,24 @@ def test_broken_rules_are_counted_in_places(tmp_path: Path):
 )
 def test_small_percentages_keep_two_digits(value: float, text: str):
     assert number_text(value, "%") == text
+
+
+def test_a_zeroth_order_within_the_area_is_told_as_that(tmp_path: Path):
+    """It is wanted light, so that less of it is not better; of several areas those where it is not wanted count."""
+
+    def area(zeroth: float, wanted: bool) -> dict[str, Any]:
+        return {"on_target": 0.9, "contrast": 0.1, "zeroth_order": zeroth, "zeroth_order_wanted": wanted}
+
+    made = {"a": area(0.116, True), "b": area(0.043, True), "c": [area(0.116, True), area(0.02, False)]}
+    made["d"] = area(0.03, False)
+    folders = {name: with_metrics(written(tmp_path / name), {"area": one}) for name, one in made.items()}
+    said = "light on target 90.0 %, contrast of the area 10.0 %, 0th order"
+    assert closing_lines(folders["a"])[0] == f"result: {said} 11.6 % (within the area)"
+    assert closing_lines(folders["c"])[0] == f"result: {said} 2.0 %"
+    assert closing_lines(folders["d"])[0] == f"result: {said} 3.0 %"
+    for pair, label, best in (("ab", "0th order (within the area)", None), ("cd", "0th order", 0)):
+        (number,) = (n for n in compare_results([folders[k] for k in pair]).numbers if n.key == "zeroth_order")
+        assert (number.label, number.best) == (label, best)
 
 
 def test_a_zeroth_order_that_is_a_spot_is_told_as_one(tmp_path: Path):

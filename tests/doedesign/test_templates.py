@@ -89,3 +89,6 @@ def test_new_lists_and_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     assert "Did you mean `top_hat`?" in capsys.readouterr().err
     assert main(["new", "lens", "--out", "mine.toml"]) == 0
     assert (tmp_path / "mine.toml").is_file()
+    assert main(["new", "--out", "other.toml"]) == 2  # of what?
+    assert "--out: goes with the name of a template only" in capsys.readouterr().err
+    assert not (tmp_path / "other.toml").exists()

@@ -55,10 +55,12 @@ def test_light_and_uniformity_of_spots_have_axes_of_their_own():
 
 
 def test_the_page_draws_the_light_that_spots_miss():
-    chart = history_chart(SPOTS)
+    chart = history_chart(SPOTS, "Weights follow.")
     assert chart is not None
     assert [one.label for one in chart.series] == ["loss", "1 - efficiency", "uniformity_error"]
     assert chart.series[1].y[0] == pytest.approx(0.09)
+    # Spots have one colour and one depth, so that no step looks at some of them.
+    assert chart.note == "Weights follow."
 
 
 def test_an_only_term_is_the_loss():

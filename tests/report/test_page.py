@@ -198,6 +198,14 @@ def test_a_zeroth_order_that_is_a_spot_is_told_as_one(run: Path, wanted: bool | 
     assert title in [block.title for block in part.blocks if isinstance(block, BarBlock)]
 
 
+def test_a_zeroth_order_within_the_area_is_told_as_that(run: Path):
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics["area"] = {"on_target": 0.9, "contrast": 0.1, "zeroth_order_wanted": True}
+    part = reached_section(open_files(run), metrics, ())
+    assert part is not None
+    assert "0th order (within the area)" in [block.title for block in part.blocks if isinstance(block, BarBlock)]
+
+
 def test_curves_are_those_of_the_table(run: Path):
     charts = {chart.title: chart for chart in blocks(gather(run), ChartBlock)}
     near, far = (charts[f"MTF, source at {depth}"] for depth in ("6 mm", "∞"))
@@ -498,6 +506,10 @@ def test_a_run_at_work_shows_its_loss(run: Path, tmp_path: Path):
     assert names(content)[0] == "history"
     assert "at work" in content.summary[0]
     assert len(blocks(content, ChartBlock)[0].x) >= 2
+    # Of one colour, one near and one far depth every step sees all, so that there is no jump to explain.
+    assert blocks(content, ChartBlock)[0].note == ""
+    terms = next(block for block in blocks(content, TableBlock) if block.title == "Objectives")
+    assert terms.note == "Values without weights."
     pages = watch_report(folder, out=tmp_path / "live.html", every_s=0.01)
     first = next(pages).read_bytes()
     assert b"at work" in first

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from doedesign.report.history import history_note
 from doedesign.report.page.blocks import (
     ChartBlock,
     ChartSeries,
@@ -44,14 +45,15 @@ def history_section(files: RunFiles) -> PageSection | None:
     Args:
         files: the run.
     """
-    return section("history", "Optimisation", [history_chart(history_of(files))])
+    return section("history", "Optimisation", [history_chart(history_of(files), history_note(files.spec))])
 
 
-def history_chart(records: Sequence[Mapping[str, Any]]) -> ChartBlock | None:
+def history_chart(records: Sequence[Mapping[str, Any]], note: str = "") -> ChartBlock | None:
     """Loss and its terms over the steps; of an efficiency what is missing.
 
     Args:
         records: a record per step.
+        note: why the loss is not smooth (`history_note`).
     """
     if not records:
         return None
@@ -65,7 +67,6 @@ def history_chart(records: Sequence[Mapping[str, Any]]) -> ChartBlock | None:
     columns = [k for k in range(len(names)) if k == 0 or not np.allclose(values[:, k], values[:, 0])]
     series = tuple(ChartSeries(names[k], tuple(rounded(v) for v in values[:, k].tolist())) for k in columns)
     steps = tuple(float(one["step"] + 1) for one in kept)
-    note = "Every step looks at some of the depths and colours, so that the curve jumps from step to step."
     spread = bool(values[:, 0].min() > 0 and values[:, 0].max() > 30 * values[:, 0].min())
     return ChartBlock("Loss and its terms, without weights", "step", "loss", steps, series, y_log=spread, note=note)
 

@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from doedesign.overview.numbers import zeroth_note
+from doedesign.report.history import history_note
 from doedesign.report.page.blocks import Bar, BarBlock, PageSection, TableBlock, section
 from doedesign.report.page.files import RunFiles, digest_of, listed_json
 from doedesign.report.page.numbers import SHARES, label_of, length, number, percent, value_of
 from doedesign.spec.process import leading_quantity
-from doedesign.spec.targets.spots import ONE_OF_THE_SPOTS
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -165,10 +166,9 @@ def _orders_zeroth(files: RunFiles, metrics: Mapping[str, Any], tolerance: Mappi
         return None
     end = min(1.0, 1.25 * max(max(bar.value, bar.high or 0.0) for bar in there)) or 1.0
     note = "The share of the light that passes as if the plate were flat, over the colours."
-    orders = metrics.get("orders") or {}
-    wanted = any(one.get("zeroth_order_wanted") for one in (orders if isinstance(orders, list) else [orders]))
+    wanted = zeroth_note(metrics)
     return BarBlock(
-        f"0th order ({ONE_OF_THE_SPOTS})" if wanted else "0th order",
+        f"0th order ({wanted})" if wanted else "0th order",
         tuple(bar._replace(end=end) for bar in there),
         note,
     )
@@ -225,5 +225,5 @@ def _terms(files: RunFiles, history: Rows) -> TableBlock | None:
     )
     rows += (("loss", "", number(first["loss"]), number(last["loss"])),)
     head = ("objective", "weight", f"step {first['step'] + 1}", f"step {last['step'] + 1}")
-    note = "Values without weights; every step looks at some depths and colours, so they jump."
+    note = f"Values without weights. {history_note(files.spec)}".rstrip()
     return TableBlock("Objectives", head, rows, note, folded=True)

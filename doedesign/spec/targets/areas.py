@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Place = Annotated[float, place(-1.0, 1.0)]
 Size = Annotated[float, place(0.1 * UM, 1.0, SIZE)]
 FLAT_PHASE = "flat"
+WITHIN_THE_AREA = "within the area"  # said of a 0th order that is wanted
 Shape = Literal["rectangle", "ellipse", "ring", "line", "picture"]
 
 
