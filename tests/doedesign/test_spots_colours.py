@@ -131,7 +131,7 @@ def test_one_plate_makes_the_same_orders_of_two_colours(tmp_path: Path):
     for one, wavelength in zip(table.tables, WAVELENGTHS_M, strict=True):
         found = sums_of(cell, 106e-9, wavelength, 24, 1)
         np.testing.assert_allclose(np.sort(one.efficiency), np.sort(found.ravel()), atol=1e-6)
-        # 83 and 86 %, 0.5 and 0.4 %. A plate for one colour alone has 92 % in it, and 20 % in the other, 74 to 92 % off.
+        # 83 and 86 %, 0.5 and 0.4 %. A plate for one colour has 92 % there, 20 % in the other, 74 to 92 % off.
         assert found.sum() > 0.78
         assert np.ptp(found) / (found.max() + found.min()) < 0.02
     told = table.measures()
