@@ -354,7 +354,7 @@ def test_what_cannot_be_is_refused():
             replace(lens, **{key: value})
     with pytest.raises(ValueError, match=r"`height_m` must have the grid's shape \(32, 32\)"):
         with_edges(levels(16), lens)
-    with pytest.raises(ValueError, match="`height_m` must be finite everywhere"):
+    with pytest.raises(InputError, match="height_m: every height must be a finite number, but got 1024 wrong pixels"):
         with_edges(np.full((32, 32), np.nan), lens)
 
 
