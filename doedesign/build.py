@@ -122,8 +122,8 @@ def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
     return Levels(spec.levels, spec.level_step_m, depths_m or ())
 
 
-def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
-    """Return a process, with what the spec leaves out taken from its stock process.
+def process_from_spec(spec: Spec | ProcessSpec, chosen: Levels | None = None) -> Process:
+    """Return the process of a whole spec or of its table of one; what that leaves out is its stock process's.
 
     Its staircase is `chosen` where the spec leaves the depths of the etches to the optimisation; errors whose mean and
     standard deviation are zero are left out of its spreads.
@@ -131,6 +131,7 @@ def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Proces
     Raises:
         InputError: the depths are still to be chosen.
     """
+    spec = spec.process if isinstance(spec, Spec) else spec
     full = spec.filled()
     defects = full.defects.in_si()
     spreads: dict[str, Normal] = {}

@@ -7,6 +7,7 @@ out of focus, or one without a lens, leaves a quadratic remainder (`Camera.curva
 
 import math
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -18,12 +19,13 @@ from fab.grid import Grid
 from fab.units import DEGREES, PlaceUnit, format_length
 from sim.illumination import Beam, EvenBeam, beam_amplitude, beam_irradiance
 from sim.lens import IDEAL, Distortion, Mapping, check_lens, direction_sines, distorted_place, image_place, sines_at
-from sim.material import fresnel_transmission, refractive_index, waves_per_metre
+from sim.material import fresnel_transmission, material, refractive_index, waves_per_metre
 
 _PARAXIAL = 0.02  # wave
 # Without a lens an image is that of the axis, moved, while an oblique chief ray adds less than so much of a wave of
 # astigmatism and coma at the rim (a Strehl ratio above 0.98) and of the distances of places.
 _ASLANT, _STRETCHED = 0.05, 0.01
+_LONGEST_M = 1e-3  # wavelength; a longer one is in other units
 Light = Literal["scalar", "edges"]
 Polarised = Literal["unpolarised", "x", "y"]
 
@@ -34,11 +36,12 @@ class Colour:
 
     Attributes:
         name: name of the channel.
-        wavelengths_m: vacuum wavelengths, metres.
-        weights: their weights, which sum to 1.
+        wavelengths_m: vacuum wavelengths, metres; a list or an array is made a tuple.
+        weights: their weights, none negative, which sum to 1.
 
     Raises:
-        InputError: another number of weights than of wavelengths, or weights that do not sum to 1.
+        InputError: a wavelength that is not positive or longer than 1 mm, another number of weights than of
+            wavelengths, negative weights, or weights that do not sum to 1.
     """
 
     name: str
@@ -46,9 +49,36 @@ class Colour:
     weights: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        """Make tuples of both, so that a camera can be hashed, and refuse what is no spectrum."""
+        for key in ("wavelengths_m", "weights"):
+            object.__setattr__(self, key, _numbers(f"colour {self.name}: {key}", getattr(self, key)))
+        if not all(0 < wavelength <= _LONGEST_M for wavelength in self.wavelengths_m):
+            rule, cure = "must be metres, positive and at most 1 mm", "For example (550e-9,)."
+            raise InputError(f"colour {self.name}: wavelengths_m", rule, f"{self.wavelengths_m}", cure)
+        if not all(weight >= 0 for weight in self.weights):
+            rule, cure = "must be numbers that are not negative", "Leave wavelengths without light out."
+            raise InputError(f"colour {self.name}: weights", rule, f"{self.weights}", cure)
         if len(self.wavelengths_m) != len(self.weights) or abs(sum(self.weights) - 1) > 1e-6:
             rule, got = "must be one for each wavelength, together 1", f"{self.weights} for {len(self.wavelengths_m)}"
             raise InputError(f"colour {self.name}: weights", rule, got, "Divide them by their sum.")
+
+
+def _numbers(where: str, given: Any) -> tuple[float, ...]:
+    """Several numbers as a tuple of floats; an InputError for anything else."""
+    try:
+        # Text would be as many numbers as it has digits.
+        return () if isinstance(given, str) else tuple(float(number) for number in given)
+    except (TypeError, ValueError) as error:
+        raise InputError(where, "must be a list of numbers", repr(given), "Give a single one as [1.0].") from error
+
+
+def _require_length(name: str, value: Any, *, signed: bool = False, infinite: bool = False) -> None:
+    """Raise an InputError unless a value is a number of metres: finite and above 0, unless other ones will do, too."""
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if (math.isfinite(number) or (infinite and number == math.inf)) and (signed or number > 0):
+        return
+    rule = f"must be metres, a{'' if signed else ' positive'} number{' or infinity' if infinite else ' that is finite'}"
+    raise InputError(name, rule, repr(value), "For example 5e-3 for 5 mm.")
 
 
 class SpectralLine(NamedTuple):
@@ -74,9 +104,10 @@ class Camera:
 
     Attributes:
         grid: cells of the DOE.
-        aperture: the clear aperture (`fab.aperture`); a number is the diameter of a round one, metres.
+        aperture: the clear aperture (`fab.aperture`); a number is the diameter of a round one, metres. Beyond the grid
+            it is dark.
         material: substrate, a name that `sim.material.material` takes.
-        colours: colour channels, in the order of the bank's first axis.
+        colours: colour channels, in the order of the bank's first axis; a list is made a tuple.
         focal_length_m: focal length of the lens.
         pixel_m: centre-to-centre distance of sensor pixels, after binning.
         window: sensor pixels computed per axis, centred on the chief ray; for an even count the chief ray
@@ -95,6 +126,11 @@ class Camera:
             infinity there is no sensor but directions: `pixel_m` and all places are direction sines.
         beam: the beam that lights the DOE, of whose power energies are shares; None for plane or spherical waves, whose
             power is that on the clear aperture.
+
+    Raises:
+        InputError: a value of another kind, a length that is not positive or not finite where it has to be, an
+            aperture that is narrower than a cell, a sensor that would lie before the lens, an unknown substrate or
+            word, or a lens that cannot image the window.
     """
 
     grid: Grid
@@ -115,8 +151,13 @@ class Camera:
     beam: Beam | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a lens that cannot image the window, and words that mean nothing here."""
+        """Refuse values that no camera has, a lens that cannot image the window, and words that mean nothing here."""
         object.__setattr__(self, "aperture", aperture_from(self.aperture))
+        if isinstance(self.colours, list):
+            object.__setattr__(self, "colours", tuple(self.colours))
+        self._require_kinds()
+        self._require_lengths()
+        self._require_opening()
         if not 0 < self.fill <= 1:
             raise InputError("fill", "must lie above 0, up to 1", self.fill, "Give the side of a pixel over its pitch.")
         if math.isinf(self.focal_length_m) != (self.distance_m is not None):
@@ -129,11 +170,48 @@ class Camera:
         if self.in_angles and self.window * self.pixel_m > 2 * (1 + 1e-9):
             rule, got = "directions end at a sine of 1", f"{self.window * self.pixel_m / 2:.4g} at the window's edge"
             raise InputError("window", rule, got, f"Choose at most {int(2 / self.pixel_m)} pixels, or finer ones.")
+        if not self.sensor_distance_m > 0:
+            got = f"a defocus of {format_length(self.defocus_m)} for a focal length of {self.focal_length_m:g} m"
+            rule, cure = "the sensor must lie behind the lens", "Choose a defocus above minus the focal length."
+            raise InputError("defocus_m", rule, got, cure)
+        if self.distance_m is None and self.pixel_m > 2 * self.sensor_distance_m:
+            rule = f"must be at most twice the sensor's distance, {format_length(self.sensor_distance_m)}"
+            raise InputError("pixel_m", rule, format_length(self.pixel_m), "Give metres, such as 3e-6 for 3 um.")
         check_lens(self.mapping, self.distortion, self.window * self.pixel_m / 2**0.5 / self.sensor_distance_m)
         for key, words in (("light", get_args(Light)), ("polarisation", get_args(Polarised))):
             if getattr(self, key) not in words:
                 rule = f"must be one of {', '.join(words)}"
                 raise InputError(key, rule, repr(getattr(self, key)), "Choose one of them.")
+
+    def _require_kinds(self) -> None:
+        """Raise an InputError for a value of another kind than it has to be."""
+        if not isinstance(self.grid, Grid):
+            cure = "Give a fab.Grid(shape, pitch_m)."
+            raise InputError("grid", "must be the raster of the DOE", type(self.grid).__name__, cure)
+        material(self.material)
+        colours: Any = self.colours
+        if not isinstance(colours, tuple) or not all(isinstance(one, Colour) for one in colours):
+            cure = 'For example (sim.Colour("green", (550e-9,), (1.0,)),).'
+            raise InputError("colours", "must be colour channels", repr(colours), cure)
+        if not isinstance(self.window, Integral) or isinstance(self.window, bool) or self.window < 1:
+            rule = "must be a whole number of pixels, at least 1, for both axes"
+            raise InputError("window", rule, repr(self.window), "For example 128.")
+
+    def _require_lengths(self) -> None:
+        """Raise an InputError for a length that is no number, or one that no camera has."""
+        _require_length("focal_length_m", self.focal_length_m, infinite=True)
+        _require_length("pixel_m", self.pixel_m)
+        _require_length("defocus_m", self.defocus_m, signed=True)
+        _require_length("doe_distance_m", self.doe_distance_m, signed=True)
+        if self.distance_m is not None:
+            _require_length("distance_m", self.distance_m, infinite=True)
+
+    def _require_opening(self) -> None:
+        """Raise an InputError for a clear aperture that is narrower than a cell, or infinite."""
+        cell_m = self.grid.pitch_m
+        if not all((1 - 1e-9) * cell_m <= side < math.inf for side in self.opening.extent_m):
+            rule = f"must be at least a cell wide, {format_length(cell_m)}, and finite"
+            raise InputError("aperture", rule, str(self.opening), "Give its diameter, or width and height, in metres.")
 
     @property
     def in_angles(self) -> bool:

@@ -151,7 +151,7 @@ def material(name: str) -> Material:
     Raises:
         InputError: neither; it lists the names that there are.
     """
-    if name in MATERIALS:
+    if isinstance(name, str) and name in MATERIALS:
         return MATERIALS[name]
     if (own := _own_material(name)) is not None:
         return own
@@ -164,7 +164,7 @@ def material(name: str) -> Material:
 
 def _own_material(name: str) -> Material | None:
     """A material by its index; None where the text does not say one, or none that a substrate can have."""
-    found = _OWN_INDEX.fullmatch(name)
+    found = _OWN_INDEX.fullmatch(name) if isinstance(name, str) else None
     if found is None:
         return None
     index, abbe, b_sign, b, c_sign, c = found.groups()

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from fab.errors import InputError
+from fab.height import refuse_where, require_filled
 from sim.aperture import open_cells
 from sim.camera import Camera, SpectralLine
 from sim.propagation.farfield import FarField, plan_far_field
@@ -25,6 +27,7 @@ from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 from sim.propagation.pupil import DoeRows, SourceColumns, cis, doe_field
 from sim.source import LitSource, SeparableSource, SourceMap, View, ViewedSource, light_of
+from sim.tracing import is_traced
 
 if TYPE_CHECKING:  # to a type checker, what subclasses define is no argument of a constructor here
     from typing import ClassVar as AbstractVar
@@ -34,6 +37,7 @@ else:
 Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
 CellSource = SourceMap | SeparableSource | LitSource | ViewedSource
 ON_AXIS = (0.0, 0.0)
+_HIGHEST_M = 1e-3  # no thin element is so high: a map that reaches higher is not in metres
 
 
 class Optic(eqx.Module):
@@ -253,6 +257,31 @@ def height_deviation(
     return transmission * jnp.conj(cis(height_m * waves_per_metre))
 
 
+def heights_on(camera: Camera, height_m: Any) -> Float[Array, "y x"]:
+    """Heights `[y, x]` of the cells of a camera's grid, metres, in single precision; traced ones are taken as they are.
+
+    Raises:
+        ValueError: another shape than the grid's.
+        InputError: masked values, something other than real numbers, a height that is not finite, or one of more than
+            1 mm, which is in other units.
+    """
+    if not is_traced(height_m):
+        require_filled(height_m, "height_m")
+        kind = np.asarray(height_m).dtype
+        if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+            rule = "must be real numbers, metres, [y, x]"
+            raise InputError("height_m", rule, f"{type(height_m).__name__} of {kind}", "Give an array of floats.")
+    height = jnp.asarray(height_m, jnp.float32)
+    if height.shape != camera.grid.shape:
+        raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
+    if not is_traced(height) and not np.max(np.abs(found := np.asarray(height))) <= _HIGHEST_M:  # so NaN is seen, too
+        rule, cure = "every height must be a finite number", "Fill the holes of the map."
+        refuse_where(found, ~np.isfinite(found), "height_m", rule, cure)
+        rule, cure = "heights are metres, at most 1 mm", "Multiply a map in other units by its unit, such as 1e-9."
+        refuse_where(found, np.abs(found) > _HIGHEST_M, "height_m", rule, cure)
+    return height
+
+
 class HeightOptic(CellOptic):
     """A DOE given by its height map, as a thin element.
 
@@ -273,11 +302,12 @@ class HeightOptic(CellOptic):
 
     @classmethod
     def of(cls, camera: Camera, height_m: Any = None) -> "HeightOptic":
-        """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); flat for the bare lens."""
+        """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); flat for the bare lens.
+
+        Errors are those of `heights_on`.
+        """
         # A flat map shares its compiled programs with every other.
-        height = jnp.asarray(np.zeros(camera.grid.shape) if height_m is None else height_m, jnp.float32)
-        if height.shape != camera.grid.shape:
-            raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
+        height = heights_on(camera, np.zeros(camera.grid.shape, np.float32) if height_m is None else height_m)
         return cls(camera, jnp.asarray(open_cells(camera.grid, camera.opening)), height)
 
     def cells(self, line: SpectralLine, source: CellSource | None = None) -> tuple[Array | None, Array | None]:

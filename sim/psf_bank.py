@@ -3,12 +3,13 @@
 # Abstract fields become fields, or properties, of subclasses.
 # pyright: reportIncompatibleVariableOverride=false
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 Table = Float[np.ndarray, "w d"] | Float[Array, "w d"]
 Length = float | str
+Depths = Length | Sequence[Length] | np.ndarray | Array
 WIDEST_RAD = np.pi / 3  # of a field angle
 if TYPE_CHECKING:  # numpy and jax arrays serve alike
     Energies = Any
@@ -49,6 +51,9 @@ class PsfBank(eqx.Module):
         field_rad: field angles (y, x).
         camera: the camera they were computed for, if it is known.
         sines: whether `pixel_m` is a direction sine, where no camera tells.
+
+    Raises:
+        InputError: energies that have not one entry for each colour and depth, or depths that are not positive.
     """
 
     energy: Energies
@@ -58,6 +63,15 @@ class PsfBank(eqx.Module):
     field_rad: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
     camera: Camera | None = eqx.field(static=True, default=None)
     sines: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self) -> None:
+        """Refuse energies that belong to other colours or depths."""
+        wanted, shape = (len(self.colours), len(self.depths_m)), np.shape(self.energy)
+        if len(shape) != 4 or shape[:2] != wanted:
+            rule = f"must be [colour, depth, y, x] for {wanted[0]} colours and {wanted[1]} depths"
+            raise InputError("energy", rule, f"shape {shape}", "Name every colour and depth of the array.")
+        if not all(depth > 0 for depth in self.depths_m):
+            raise InputError("depths_m", "must be positive, metres", str(self.depths_m), "For example (0.05, np.inf).")
 
     @property
     def in_angles(self) -> bool:
@@ -158,7 +172,7 @@ class PsfBank(eqx.Module):
         order = np.argsort([1 / depth for depth in self.depths_m])
         curvatures = np.array([1 / self.depths_m[d] for d in order])
         # The slack lets a depth through that was rounded on its way; it is far below any change of a PSF.
-        wanted, slack = 1 / depth_m, 1e-6 * curvatures[-1]
+        wanted, slack = 1 / depth_m if depth_m else np.inf, 1e-6 * curvatures[-1]
         if not curvatures[0] - slack <= wanted <= curvatures[-1] + slack:
             depths = sorted(self.depths_m)
             rule = f"must lie within the depths of the PSF bank, {depths[0]:g} to {depths[-1]:g} m"
@@ -226,10 +240,14 @@ def optic_of(optic: Any, camera: Camera | None = None, depths_m: Sequence[float]
 
     It is ready for sources at some depths, metres.
 
-    A ValueError for a map without a camera or of another shape than its grid, or a camera of another aperture,
-    substrate or kind of light than the optic's, which keeps its own grid; a TypeError for a camera beside an optic that
-    is not made of cells.
+    An InputError for something other than a camera in its place, or heights that `sim.optic.heights_on` refuses; a
+    ValueError for a map without a camera or of another shape than its grid, or a camera of another aperture, substrate
+    or kind of light than the optic's, which keeps its own grid; a TypeError for a camera beside an optic that is not
+    made of cells.
     """
+    if camera is not None and not isinstance(camera, Camera):
+        cure = "A design has one: design.camera."
+        raise InputError("camera", "must be a sim.Camera", f"a {type(camera).__name__}", cure)
     if hasattr(optic, "as_optic"):
         found: Optic = optic.as_optic()
         if camera is None:
@@ -242,9 +260,17 @@ def optic_of(optic: Any, camera: Camera | None = None, depths_m: Sequence[float]
     return optic_as_drawn(camera, optic, depths_m=depths_m)
 
 
-def depths_from(depths: Length | Sequence[Length]) -> tuple[float, ...]:
-    """One depth or several, positive, in metres or with a unit ("5 mm", "inf"), in metres."""
-    given: Any = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
+def depths_from(depths: Depths) -> tuple[float, ...]:
+    """One depth or several, positive, in metres or with a unit ("5 mm", "inf"), in metres.
+
+    Raises:
+        InputError: none, one that is not positive, something other than depths, or depths that jax is tracing.
+    """
+    if is_traced(depths):
+        rule, got = "must be known before a program is compiled", "depths that jax traces"
+        raise InputError("depths", rule, got, "Leave them out of grad, jit and vmap; heights may be traced.")
+    given: Any = depths.tolist() if isinstance(depths, np.ndarray | np.generic | jax.Array) else depths
+    given = given if isinstance(given, Iterable) and not isinstance(given, str) else [given]
     found = tuple(metres(depth, "depth", infinite=True) for depth in given)
     if not found or not all(depth > 0 for depth in found):
         raise InputError("depths", "must be positive, at least one", str(given), 'For example "5 cm", or inf.')
@@ -271,7 +297,7 @@ def field_from(field_rad: Any) -> tuple[float, float]:
 def psf(
     optic: Any,
     camera: Camera | None = None,
-    depths: Length | Sequence[Length] = np.inf,
+    depths: Depths = np.inf,
     *,
     field_rad: tuple[float, float] = ON_AXIS,
     propagation: Propagation | None = None,
@@ -298,11 +324,13 @@ def psf(
 
     Raises:
         ValueError: a height map that does not match its camera, or what the optic cannot do.
-        InputError: a wavelength outside the material's range, eq. 6 violated on a direct path, or depths or field
-            angles that cannot be used.
+        InputError: heights that are not finite or not in metres, a wavelength outside the material's range, eq. 6
+            violated on a direct path, or depths or field angles that cannot be used.
     """
     depths_m, field_rad = depths_from(depths), field_from(field_rad)
     chosen = optic_of(optic, camera, depths_m)
+    if not chosen.colours:
+        raise InputError("colours", "a camera must have one for each PSF", "none", "Give its colour channels.")
     traced = is_traced(chosen) or in_jit()
 
     def light(asked: tuple[float, SpectralLine]) -> Any:

@@ -9,7 +9,6 @@ seem to resolve nothing at the sensor's own limit.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -23,7 +22,7 @@ from sim.camera import Camera, SpectralLine
 from sim.metrics import near_and_far
 from sim.optic import ON_AXIS, CellOptic
 from sim.propagation.pupil import DoeRows, SourceColumns, block_size, doe_field, in_blocks
-from sim.psf_bank import Length, depths_from, optic_of
+from sim.psf_bank import Depths, depths_from, optic_of
 from sim.threads import at_once
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ def _row_spectra(rows: DoeRows, columns: SourceColumns) -> Array:
 def mtf(
     optic: Any,
     camera: Camera | None = None,
-    depths: Length | Sequence[Length] = np.inf,
+    depths: Depths = np.inf,
     count: int = 160,
     *,
     field_rad: tuple[float, float] = ON_AXIS,

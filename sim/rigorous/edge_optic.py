@@ -31,7 +31,7 @@ from fab.grid import Grid
 from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.material import refractive_index
-from sim.optic import HeightOptic, ViewedOptic
+from sim.optic import HeightOptic, ViewedOptic, heights_on
 from sim.propagation.oblique import oblique_waves
 from sim.rigorous.cells_and_walls import light_of_cells_and_walls
 from sim.rigorous.corner_light import corner_unit
@@ -139,14 +139,11 @@ def with_edges(
         the DOE, lit from the side of its relief; a function of the heights for `jax.grad`, not for `jax.jvp`.
 
     Raises:
-        ValueError: heights of another shape than the grid's, or, unless traced, one that is not finite.
+        ValueError: heights of another shape than the grid's.
+        InputError: heights that `sim.optic.heights_on` refuses.
     """
-    drawn, height = camera, jnp.asarray(height_m, jnp.float32)
-    if height.shape != camera.grid.shape:
-        raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
+    drawn, height = camera, heights_on(camera, height_m)
     range_m = None if is_traced(height) else float(jnp.ptp(height))
-    if range_m is not None and not np.isfinite(range_m):
-        raise ValueError("`height_m` must be finite everywhere, but some of it is not")
     wavelengths = tuple(dict.fromkeys(wavelengths_m or (line.wavelength_m for line in camera.lines)))
     depths = min(depths_m), max(depths_m)
     drawn_m, parts = height, 1

@@ -559,3 +559,8 @@ def test_what_no_plate_can_have_is_not_written():
         variation_to_toml(Variation(corner_radius_m=-1e-6))
     with pytest.raises(ValueError, match="overlay_x"):
         variation_to_toml(Variation(overlay_x_m=(math.nan,)))
+
+
+def test_a_whole_spec_has_the_process_of_its_table():
+    spec = load_spec(QUICK)
+    assert process_from_spec(spec) == process_from_spec(spec.process)

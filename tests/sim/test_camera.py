@@ -1,7 +1,16 @@
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from bench.reference import make_camera
+from fab.aperture import RectangularAperture
+from fab.errors import InputError
+from sim.camera import Colour
 from sim.lens import direction_sines
 from sim.material import refractive_index
 from sim.source import path_at_m, source_path_m, wrapped_waves
@@ -83,3 +92,93 @@ def test_a_camera_can_be_a_static_argument():
     again = make_camera(64, 4.4e-3, 8e-3, 3.7e-6, 32)
     assert hash(again) == hash(CAMERA)
     assert again == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"focal_length_m": 0.0}, "focal_length_m: must be metres, a positive number"),
+        ({"focal_length_m": -8e-3}, "focal_length_m: must be metres"),
+        ({"focal_length_m": np.nan}, "focal_length_m: must be metres"),
+        ({"pixel_m": 0.0}, "pixel_m: must be metres"),
+        ({"pixel_m": 3.7}, "pixel_m: must be at most twice the sensor's distance, 8 mm"),
+        ({"window": 0}, "window: must be a whole number of pixels"),
+        ({"defocus_m": np.inf}, "defocus_m: must be metres, a number that is finite"),
+        ({"defocus_m": -8e-3}, "defocus_m: the sensor must lie behind the lens"),
+        ({"defocus_m": -16e-3}, "defocus_m: the sensor must lie behind the lens"),
+        ({"focal_length_m": np.inf, "distance_m": -0.1}, "distance_m: must be metres"),
+        ({"material": "glass"}, "material: must be one of"),
+        ({"aperture": 0.0}, "aperture: must be at least a cell wide"),
+        ({"aperture": np.nan}, "aperture: must be at least a cell wide"),
+        ({"aperture": 1e-9}, "aperture: must be at least a cell wide"),  # sampled for hours
+        ({"aperture": np.inf}, "aperture: must be at least a cell wide"),
+        ({"aperture": RectangularAperture((1e-3, -1e-3))}, "aperture: must be at least a cell wide"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(changes: dict[str, Any], message: str):
+    with pytest.raises(InputError) as error:
+        replace(CAMERA, **changes)
+    assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "weights", "message"),
+    [
+        ((550.0,), (1.0,), "colour g: wavelengths_m: must be metres"),
+        ((0.0,), (1.0,), "colour g: wavelengths_m: must be metres"),
+        ((550e-9, 600e-9), (2.0, -1.0), "colour g: weights: must be numbers that are not negative"),
+        ((550e-9,), (np.nan,), "colour g: weights: must be numbers that are not negative"),
+        ((), (), "colour g: weights: must be one for each wavelength"),
+    ],
+)
+def test_a_colour_that_cannot_be_is_refused(wavelengths: Any, weights: Any, message: str):
+    with pytest.raises(InputError) as error:
+        Colour("g", wavelengths, weights)
+    assert str(error.value).startswith(message)
+
+
+# Without the checks of types that tests have: values of other kinds, as a script may give them.
+OTHER_KINDS = """
+from dataclasses import replace
+import numpy as np
+from bench.reference import make_camera
+from sim.camera import Colour
+
+camera = make_camera(64, 4.4e-3, 8e-3, 3.7e-6, 32)
+for changes in (
+    {"grid": (64, 64)}, {"focal_length_m": "8 mm"}, {"pixel_m": "3.7 um"}, {"window": 31.5}, {"window": (32, 32)},
+    {"doe_distance_m": "1 mm"}, {"colours": (550e-9,)}, {"material": 1.52},
+):
+    try:
+        replace(camera, **changes)
+    except Exception as error:
+        print(type(error).__name__, error)
+for wavelengths in (550e-9, ("550 nm",), "5"):
+    try:
+        Colour("g", wavelengths, (1.0,))
+    except Exception as error:
+        print(type(error).__name__, error)
+listed = replace(camera, colours=[Colour("g", np.array([500e-9, 600e-9]), [0.5, 0.5])])
+print(hash(listed) == hash(replace(camera, colours=(Colour("g", (500e-9, 600e-9), (0.5, 0.5)),))))
+"""
+
+
+def test_values_of_other_kinds_are_refused_and_lists_are_taken():
+    root = Path(__file__).parents[2]
+    run = subprocess.run([sys.executable, "-c", OTHER_KINDS], cwd=root, capture_output=True, text=True, check=True)
+    *told, last = run.stdout.splitlines()
+    wanted = (
+        "grid: must be the raster of the DOE",
+        "focal_length_m: must be metres",
+        "pixel_m: must be metres",
+        "window: must be a whole number of pixels",
+        "window: must be a whole number of pixels",
+        "doe_distance_m: must be metres",
+        "colours: must be colour channels",
+        "material: must be one of",
+        *["colour g: wavelengths_m: must be a list of numbers"] * 2,
+        "colour g: weights: must be one for each wavelength",  # of no number at all
+    )
+    for line, start in zip(told, wanted, strict=True):
+        assert line.startswith(f"InputError {start}")
+    assert last == "True"

@@ -1,5 +1,7 @@
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from sim.camera import Colour
 from sim.optic import HeightOptic
 from sim.propagation.farfield import FarField
 from sim.propagation.fresnel import DirectPath
-from sim.psf_bank import field_from, psf
+from sim.psf_bank import PsfBank, depths_from, field_from, psf
 
 ONE = make_camera(128, 0.3e-3, 0.54e-3, 1.85e-6, 32)
 HEIGHT = wrapped_map(128)
@@ -122,3 +124,50 @@ def test_a_colour_and_pixels_that_cannot_be_are_refused():
         Colour("a", (5e-7, 6e-7), (1.0, 1.0))
     with pytest.raises(InputError, match="fill: must lie above 0, up to 1"):
         dataclasses.replace(ONE, fill=2.0)
+
+
+@pytest.mark.parametrize(
+    ("height", "message"),
+    [
+        (np.where(np.arange(128) == 3, np.nan, HEIGHT), "height_m: every height must be a finite number"),
+        (1e9 * HEIGHT, "height_m: heights are metres, at most 1 mm"),
+        (np.arange(128**2).reshape(128, 128), "height_m: heights are metres, at most 1 mm"),  # levels
+        (HEIGHT + 0.1j * HEIGHT, "height_m: must be real numbers"),
+        (HEIGHT > 0, "height_m: must be real numbers"),
+        (np.ma.masked_less(HEIGHT, 1e-7), "height_m: every pixel must have a value"),
+    ],
+)
+def test_heights_that_are_none_are_refused(height: np.ndarray, message: str):
+    """They gave light: NaN everywhere, that of other heights, or that of what lay under a mask."""
+    with pytest.raises(InputError) as error:
+        psf(height, ONE)
+    assert str(error.value).startswith(message)
+
+
+def test_depths_may_be_arrays_of_jax_but_not_traced():
+    assert depths_from(jnp.array([0.5, np.inf])) == depths_from(np.array([0.5, np.inf])) == (0.5, np.inf)
+    assert depths_from(jnp.float32(0.5)) == (0.5,)
+    with pytest.raises(InputError, match="depth: must be metres"):
+        depths_from(np.ones((2, 2)))
+    with pytest.raises(InputError, match="depths: must be known before a program is compiled"):
+        jax.grad(lambda depth: depths_from(depth)[0])(0.1)
+
+
+def test_a_bank_has_one_entry_for_each_colour_and_depth():
+    """Beside measured PSFs, of which a depth too few would take those of another."""
+    energy = np.ones((3, 2, 5, 5), np.float32)
+    bank = PsfBank(energy, ("R", "G", "B"), (0.05, np.inf), 3e-6)
+    with pytest.raises(InputError, match=r"energy: must be \[colour, depth, y, x\] for 3 colours and 1 depths"):
+        PsfBank(energy, bank.colours, (0.05,), 3e-6)
+    with pytest.raises(InputError, match=r"energy: must be .* for 2 colours and 2 depths"):
+        PsfBank(energy, ("R", "G"), bank.depths_m, 3e-6)
+    with pytest.raises(InputError, match="depths_m: must be positive"):
+        PsfBank(energy, bank.colours, (0.0, np.inf), 3e-6)
+    with pytest.raises(InputError, match="depth: must lie within the depths of the PSF bank"):
+        bank.at(0.0)
+    assert jax.tree.map(np.sum, bank).energy == 150  # what jax makes of one is not looked at
+
+
+def test_a_camera_without_colours_has_no_psfs():
+    with pytest.raises(InputError, match="colours: a camera must have one for each PSF, but got none"):
+        psf(HEIGHT, dataclasses.replace(ONE, colours=()))
