@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.special import erf
 
 import doedesign.optimization as optimization
 from doedesign.areas.design import AreaTask
-from doedesign.areas.problem import mode_fields
+from doedesign.areas.problem import AreaProblem, AreaScore, AreaSet, mode_fields
 from doedesign.areas.shape import AreaTable, AreaTables, Profile, area_table, areas_of_design, light_on
 from doedesign.areas.target import AreaTarget, finest_detail_m, in_plane
 from doedesign.areas.transport import _coarse, transport_phase
@@ -584,6 +585,60 @@ def test_an_area_is_drawn_with_its_size_and_edges(
     assert np.sum(rows @ target.value * columns, axis=1) == pytest.approx(0.5, abs=0.02)
     frame = (np.abs(y)[:, None] <= target.size_m[0] / 2 + 40e-6) & (np.abs(x) <= width_m / 2 + 40e-6)
     np.testing.assert_array_equal(target.dark, frame & (target.value < 0.1))
+
+
+def test_light_is_judged_by_formulas(tmp_path: Path):
+    """Noise on the light wanted, with a frame that should be dark, against sums in double precision."""
+    spec, rng = spec_of(tmp_path, "area.dark=40 um", "area.edge=50 um"), np.random.default_rng(5)
+    assert spec.areas
+    target = AreaTarget.of(spec.areas[0], camera_from_spec(spec))
+    light = 1e-4 * (1.3 * target.value + rng.uniform(0, 0.4, target.value.shape))
+    flat, lit, even = target.value >= 0.9, target.value >= 0.135, (target.value >= 0.9) | target.dark
+    wanted = np.where(flat, 1.0, target.value)
+    over = light / (np.sum((wanted * light)[even]) / np.sum(wanted[even] ** 2))
+    edges = np.maximum(np.abs(over - wanted) - 0.1, 0)[lit & ~even]
+    border = np.sum(target.border[0] @ over * target.border[1], axis=1) - 0.5
+    contrast = np.sqrt(np.sum((over - wanted)[even] ** 2) / flat.sum())
+    misplaced = np.sqrt(np.mean(border**2) + np.sum(edges**2) / flat.sum())
+    found = eqx.filter_jit(AreaScore.judge)(AreaScore.of(target), jnp.asarray(light, jnp.float32))
+    assert [float(part) for part in found] == pytest.approx([light[lit].sum(), contrast, misplaced], rel=1e-4)  # single
+    loss = 1 - light[lit].sum() + 0.7 * np.hypot(contrast, misplaced)
+    assert float(found.loss(0.7)) == pytest.approx(loss, rel=1e-5)
+    # And where the phase is given: light on area and frame that is not in the wave, over what is.
+    given = AreaScore.of(replace(target, phase=rng.uniform(0, 6, light.shape)))
+    assert given.wave is not None
+    wave = np.asarray(given.wave, complex)
+    field = np.sqrt(light) * np.exp(1j * (np.angle(wave) + rng.normal(0, 0.5, light.shape)))
+    inside = abs(np.vdot(wave, field)) ** 2
+    contrast = np.sqrt(light[lit | target.dark].sum() / inside - 1)
+    found = eqx.filter_jit(AreaScore.judge_field)(given, jnp.asarray(field, jnp.complex64))
+    assert [float(part) for part in found] == pytest.approx([inside, contrast, 0], rel=1e-4)
+
+
+def test_the_worst_of_several_areas_counts_most(tmp_path: Path):
+    """The logarithm of the mean of exp(12 loss), of heights that begin again after a span."""
+    spec, rng = spec_of(tmp_path), np.random.default_rng(6)
+    camera = camera_from_spec(spec)
+    assert spec.areas
+    target = AreaTarget.of(spec.areas[0], camera)
+    problem = AreaProblem.of(target, camera)
+    phase = rng.uniform(0, 2 * np.pi, camera.grid.shape)
+    light = light_on(HeightOptic.of(camera, phase / (2 * np.pi * camera.waves_per_metre(532e-9))), target)
+    sets = AreaSet((problem,)), AreaSet((problem, replace(problem, turn=0.5))), AreaSet((problem, problem), span=7.0)
+    weights = np.array([0.2, 0.5])
+
+    @jax.jit
+    def found(phase: jax.Array) -> Any:
+        one, half, again = sets
+        single = [one.loss(phase, weight[None]) for weight in jnp.asarray(weights)]
+        return problem.light(phase), single, half.judge(2 * phase)[1], again.loss(phase + 14.0, jnp.asarray(weights))
+
+    seen, losses, half, both = found(jnp.asarray(phase, jnp.float32))
+    np.testing.assert_allclose(seen, light, rtol=1e-3, atol=1e-4 * light.max())  # single precision
+    assert float(half.efficiency) == pytest.approx(light[target.lit].sum(), rel=1e-4)
+    assert losses[1] - losses[0] > 0.1
+    # A phase of 20 in single precision.
+    assert float(both) == pytest.approx(np.log(np.mean(np.exp(12 * np.array(losses)))) / 12, rel=1e-4)
 
 
 def test_an_area_of_a_plane_moves_the_sensor_there(tmp_path: Path):
