@@ -14,6 +14,7 @@ from doedesign.build import camera_from_spec
 from doedesign.focus.depth import FocusTable, focus_of_design, focus_table
 from doedesign.focus.design import FocusTask
 from doedesign.focus.foci import Foci
+from doedesign.focus.problem import BESIDE, ring_count, ring_numbers
 from doedesign.prediction import on_target
 from doedesign.runs.level_maps import open_design
 from fab.aperture import RectangularAperture
@@ -412,3 +413,34 @@ def test_words_and_rows_of_foci(spec_file: Path):
     assert rows[0]["width_y_m"] == pytest.approx(wide_y * 1e-6)
     assert (rows[1]["width_y_m"], rows[1]["width_x_m"], rows[1]["strength"]) == (None, None, 0.25)
     assert told.summary()["focus_width"] is None
+
+
+def test_usual_widths_are_those_of_an_ideal_lens_or_of_rings(spec_file: Path):
+    """1.15 times 1.029 lambda z / D, z the way to the rim; no finer than cells make it, 1.029 times two of them."""
+    spec = doedesign.load_spec(spec_file, [])
+    camera = camera_from_spec(spec)
+    assert spec.focus is not None
+    foci = Foci.shown(spec.focus.model_copy(update={"distances_m": (4e-3, 1e-4)}), camera)
+    lens = 1.029 * 532e-9 * np.hypot(4e-3, camera.aperture_m / 2) / camera.aperture_m
+    assert foci.width_m == pytest.approx([1.15 * lens, 1.15 * 1.029 * 2 * 2e-6], rel=1e-3)
+    assert foci.weight == pytest.approx([0.5, 0.5])
+    way = {"distances_m": (2e-3, 40e-3), "through": True, "widths_m": (6e-6, 70e-6)}
+    foci = Foci.shown(spec.focus.model_copy(update=way), camera)
+    power = np.log(70 / 6) / np.log(20)  # so that both ends have their widths
+    assert foci.width_m == pytest.approx(6e-6 * (foci.distance_m / 2e-3) ** power, rel=1e-9)
+    assert foci.weight[1:-1] == pytest.approx(1 / 60, rel=1e-9)  # distances in equal ratios
+
+
+def test_rings_reach_a_cell_beyond_the_rim(spec_file: Path):
+    camera = camera_from_spec(doedesign.load_spec(spec_file, []))
+    count = ring_count(camera)
+    assert (count - 1) / 3 < camera.aperture_m / 2 / 2e-6 + 1 <= count / 3  # three to a cell
+    numbers = ring_numbers(camera)
+    radius = np.hypot(camera.grid.axis_m("y")[:, None], camera.grid.axis_m("x")) / 2e-6 * 3
+    near = numbers < count - 1
+    assert np.all((numbers <= radius) & ((radius < numbers + 1) | ~near))
+    assert numbers.max() == count - 1
+    # The loss of a report looks where the search does, beyond half the width wanted.
+    table = table_of_a_slit(spec_file)
+    assert np.isin(BESIDE, table.places).all()
+    assert (min(BESIDE), max(BESIDE)) == (0.5, 1.0)

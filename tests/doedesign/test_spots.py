@@ -174,6 +174,25 @@ def test_exchange_finds_dammanns_grating_and_never_spoils():
         assert task.light(again).efficiency >= light.efficiency * (1 - 1e-6)
 
 
+@pytest.mark.parametrize(("count", "shape"), [((3, 1), (1, 16)), ((1, 3), (16, 1)), ((3, 3), (16, 16))])
+def test_a_coarser_cell_has_the_same_orders(count: tuple[int, int], shape: tuple[int, int]):
+    """Half as many cells, twice as wide, along every axis that has several: levels that both have are the same DOE."""
+    fine = problem(count, 16, 4)
+    coarse = fine.coarser()
+    assert coarse.grid.shape == tuple(n // 2 if n > 1 else 1 for n in shape)
+    assert coarse.grid.pitch_m == 2 * PITCH_M
+    level = np.random.default_rng(4).integers(0, 4, coarse.grid.shape).astype(np.uint8)
+    drawn = np.kron(level, np.ones([2 if n > 1 else 1 for n in shape], np.uint8))
+    np.testing.assert_allclose(coarse.amplitudes(level), fine.amplitudes(drawn), rtol=0, atol=1e-6)  # single precision
+
+
+def test_spots_without_light_are_not_uneven():
+    assert spot_light(np.zeros(3), np.full(3, 1 / 3)) == (0.0, 0.0)
+    assert spot_light(np.array([0.1, 0.3]), np.array([0.25, 0.75])) == pytest.approx((0.4, 0.0))
+    assert spot_light(np.array([0.1, 0.3]), np.array([0.5, 0.5])) == pytest.approx((0.4, 0.5))
+    assert spot_light(np.array([0.1, 0.3]), np.array([0.5, 0.5])).merit(0.6) == pytest.approx(0.1)
+
+
 def test_weights_are_obeyed():
     spots = Spots(orders_of((3, 1), 64).waves_per_m, shares_of((1, 2, 1), 3))
     task = SpotProblem.on(Grid((1, 64), PITCH_M), np.ones((1, 64), np.float32), spots, even(64))
