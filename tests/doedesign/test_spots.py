@@ -117,6 +117,7 @@ def test_the_search_finds_the_known_optimum(count: tuple[int, int], known: float
     found = search_phases(spots, points, starts=40, seed=0, uniformity=1.0)
     # Some two dozen points stand for a period: 0.6 % for two beams, whose phase jumps.
     assert found.efficiency == pytest.approx(known, abs=6e-3)
+    assert ceiling_of(count, 10**5).efficiency == pytest.approx(known, abs=5e-5)  # four digits
 
 
 def test_the_search_goes_axis_by_axis_where_orders_are_many(monkeypatch: pytest.MonkeyPatch):
@@ -291,6 +292,18 @@ def test_ceilings_name_their_source():
         ceiling_of((7, 1), 8, equal=False),
     ):
         assert (other.efficiency, other.source) == (None, "none known")
+
+
+def test_ceilings_are_known_of_rows_and_squares():
+    """The phases of two rows, one along each axis, add up to a square with the product of what each has."""
+    rows, squares = [(n, 1) for n in (2, 3, 5, 6, 7, 8, 9)], [(n, n) for n in range(2, 10)]
+    known = {(x, y): ceiling_of((x, y), 10**5).efficiency for x in range(1, 11) for y in range(1, x + 1)}
+    assert [count for count, efficiency in known.items() if efficiency is not None] == sorted(rows + squares)
+    for count, _ in rows:
+        row, square = known[count, 1], known[count, count]
+        assert row is not None
+        assert square is not None
+        assert row**2 - 1e-4 <= square < 1  # four digits
 
 
 def test_a_picture_of_a_table():
