@@ -10,7 +10,7 @@ import pytest
 from doedesign.spec.targets.arrangements import grid_orders, hexagonal_places, ring_places
 from doedesign.spec.targets.spots import open_periods
 from doedesign.spots import search
-from doedesign.spots.exchange import exchange
+from doedesign.spots.exchange import _merit, cooled, exchange, offered, offers
 from doedesign.spots.orders import ceiling_of, order_table
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, shares_of
@@ -173,6 +173,49 @@ def test_exchange_finds_dammanns_grating_and_never_spoils():
     for level, light in zip(found[:3], lights, strict=False):
         again = exchange(task, level, sweeps=20, seed=9, uniformity=0.0, heat=0.05)
         assert task.light(again).efficiency >= light.efficiency * (1 - 1e-6)
+
+
+def test_offers_are_of_levels_of_neighbours_or_of_others():
+    level = np.random.default_rng(5).integers(0, 7, (3, 4)).astype(np.uint8)
+    neighbours = [np.roll(level, step, axis) for axis in (0, 1) for step in (-1, 1)]  # below, above, behind, before
+    for y, x in np.ndindex(level.shape):
+        assert [offered(level, y, x, 0, side, 7) for side in range(4)] == [each[y, x] for each in neighbours]
+        assert [offered(level, y, x, k, 0, 7) for k in range(1, 7)] == [(level[y, x] + k) % 7 for k in range(1, 7)]
+    order, chance, others, sides = offers(np.random.default_rng(6), 40000, 7, 0.3)
+    assert np.array_equal(np.sort(order), np.arange(40000))
+    assert 0 <= chance.min() < 0.01 < 0.99 < chance.max() < 1
+    # Half of the others are the next level up or down, the rest any: of 40 000, within five standard deviations.
+    wanted = np.array([0.7, *(0.3 * (0.25 * np.isin(k, (1, 6)) + 0.5 / 6) for k in range(1, 7))])
+    assert np.bincount(others, minlength=7) / 40000 == pytest.approx(wanted, abs=5 * (0.3 * 0.7 / 40000) ** 0.5)
+    assert np.bincount(sides) / 40000 == pytest.approx(0.25, abs=5 * (0.25 * 0.75 / 40000) ** 0.5)
+    assert set(offers(np.random.default_rng(6), 1000, 2, 0.3).others) == {0, 1}
+    assert [cooled(2.0, sweep, 10) for sweep in (0, 7, 9)] == pytest.approx([2.0, 0.0, 0.0])
+    assert cooled(2.0, 3, 10) == pytest.approx(2.0 * (4 / 7) ** 2)
+
+
+def test_the_merit_of_an_exchange_is_that_of_its_formula():
+    """Four spots of unequal shares: their sum, or the light in a wave, less what fourth powers of deviations say."""
+    rng, shares = np.random.default_rng(7), shares_of((1, 2, 3, 4), 4)
+    light = 0.4 * (rng.normal(size=4) + 1j * rng.normal(size=4))
+    power = np.abs(light) ** 2
+    uneven = 1.4 * np.mean((power / shares / np.mean(power / shares) - 1) ** 4) ** 0.25
+    none, wave = np.zeros(0, complex), np.sqrt(shares) * np.exp(1j * rng.uniform(0, 6, 4))
+    assert _merit(light, shares, none, 0.6) == pytest.approx(power.sum() - 0.6 * uneven, rel=1e-12)
+    in_wave = abs(np.vdot(wave, light)) ** 2
+    assert _merit(light, shares, wave.conj(), 0.6) == pytest.approx(in_wave - 0.6 * uneven, rel=1e-12)
+    assert np.isfinite(_merit(0 * light, shares, none, 0.6))
+
+
+def test_an_exchange_without_heat_takes_what_is_better_and_nothing_else():
+    task = problem((3, 1), 32, 4)
+    begun = np.random.default_rng(8).integers(0, 4, (1, 32)).astype(np.uint8)
+    merits, none = [], np.zeros(0, complex)
+    for sweeps in range(6):
+        level = exchange(task, begun, sweeps=sweeps, seed=1, uniformity=0.5, heat=0.0)
+        merits.append(_merit(task.amplitudes(level).astype(complex), task.spots.shares, none, 0.5))
+    assert (np.diff(merits) > -1e-6).all()  # single precision
+    assert merits[1] > merits[0] + 0.1
+    assert merits[-1] > merits[1]
 
 
 @pytest.mark.parametrize(("count", "shape"), [((3, 1), (1, 16)), ((1, 3), (16, 1)), ((3, 3), (16, 16))])
