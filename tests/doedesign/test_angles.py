@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from doedesign.areas.design import AreaTask
-from doedesign.areas.shape import areas_of_design
+from doedesign.areas.shape import area_table, areas_of_design
+from doedesign.areas.target import AreaTarget
 from doedesign.build import camera_from_spec
 from doedesign.capture.from_spec import sensor_side
 from doedesign.optimization import optimize
@@ -134,6 +135,23 @@ def test_an_area_in_degrees_is_that_of_a_lens(tmp_path: Path):
     assert "deg at half the light" in table.describe()
     assert table.to_csv().startswith("axis,place_deg,")
     assert not any(key.endswith("_m") for key in numbers)
+
+
+def test_profiles_of_an_area_are_told_by_angle_from_its_middle(tmp_path: Path):
+    """Four degrees off the axis, where differences of sines are smaller by 0.4 %."""
+    spec = spec_of(tmp_path, AREA.replace(" }", ', offset = ["4 deg", "-3 deg"] }'))
+    camera = camera_from_spec(spec)
+    assert spec.areas
+    target = AreaTarget.of(spec.areas[0], camera)
+    table = area_table(HeightOptic.of(camera), target)
+    for profile, sines, middle in ((table.along_x, target.sines_x, 4), (table.along_y, target.sines_y, -3)):
+        assert profile is not None
+        assert profile.in_angles
+        degrees = np.degrees(np.arcsin(sines)) - middle
+        np.testing.assert_allclose(profile.in_unit(profile.place_m, DEGREES), degrees, rtol=0, atol=1e-9)
+    row = table.to_csv().splitlines()[1].split(",")
+    assert table.to_csv().startswith("axis,place_deg,")
+    assert float(row[1]) == pytest.approx(np.degrees(np.arcsin(target.sines_x[0])) - 4)
 
 
 def test_the_table_of_spots_tells_degrees(tmp_path: Path):

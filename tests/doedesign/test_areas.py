@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,9 +14,9 @@ from scipy.special import erf
 
 import doedesign.optimization as optimization
 from doedesign.areas.design import AreaTask
-from doedesign.areas.problem import mode_fields
-from doedesign.areas.shape import AreaTable, Profile, area_table, areas_of_design, light_on
-from doedesign.areas.target import AreaTarget, finest_detail_m
+from doedesign.areas.problem import AreaProblem, AreaScore, AreaSet, mode_fields
+from doedesign.areas.shape import AreaTable, AreaTables, Profile, area_table, areas_of_design, light_on
+from doedesign.areas.target import AreaTarget, finest_detail_m, in_plane
 from doedesign.areas.transport import _coarse, transport_phase
 from doedesign.build import camera_from_spec
 from doedesign.design.design import Design
@@ -34,6 +35,7 @@ from doedesign.spec import (
     spec_to_json,
     spec_to_toml,
 )
+from fab.aperture import RectangularAperture
 from fab.errors import InputError
 from fab.order.verify import verify
 from fab.pictures import write_pixels
@@ -433,6 +435,223 @@ def test_a_profile_finds_size_and_edges():
     assert profile.edge_m == pytest.approx(2 * (0.9 - 0.135), abs=1e-6)
     assert Profile(at, 0 * at, at).size_m is None
     assert Profile(at, 0 * at, at).edge_m is None
+
+
+def light_of_a_slit(tmp_path: Path, *overrides: str) -> tuple[AreaTable, np.ndarray]:
+    """A table of an open slit before a lens, and its field on the lattice in closed form: a product of two sincs."""
+    sensor = ("sensor.pitch=6.9 um", "sensor.window=128")
+    area = ("area.width=200 um", "area.height=320 um", 'area.offset=["23 um", "-41 um"]')
+    spec = spec_of(tmp_path, *sensor, *area, *overrides)
+    sides = 248e-6, 496e-6  # whole cells
+    camera = replace(camera_from_spec(spec), aperture=RectangularAperture(sides))
+    assert spec.areas
+    target = AreaTarget.of(spec.areas[0], camera, samples=8**0.5)  # so that none lies on a zero of a sinc
+    parts = [
+        np.sqrt(side * np.ptp(sines[:2]) / 532e-9) * np.sinc(side * sines / 532e-9)
+        for side, sines in zip(sides, (target.sines_y, target.sines_x), strict=True)
+    ]
+    return area_table(HeightOptic.of(camera), target), np.outer(*parts)
+
+
+def test_the_table_of_a_slit_is_that_of_its_sincs(tmp_path: Path):
+    """An area off the axis, of other sides than the slit, in which fringes are anything but even."""
+    table, field = light_of_a_slit(tmp_path)
+    target, camera = table.target, table.camera
+    light = field**2
+    over = light / light[target.flat].mean()
+    exact = 1e-4  # single precision of factors and fields
+    np.testing.assert_allclose(table.light, over, rtol=exact, atol=exact * over.max())
+    assert table.efficiency == pytest.approx(light[target.lit].sum(), rel=exact)
+    assert table.contrast == pytest.approx(np.sqrt(np.mean((over[target.flat] - 1) ** 2)), rel=exact)
+    assert table.side_lobe == pytest.approx(over[~target.lit].max(), rel=exact)
+    assert table.zeroth_order == pytest.approx(1, rel=exact)
+    assert table.wave is None
+    y, x = camera.image_m(target.sines_y, 0.0)[0], camera.image_m(0.0, target.sines_x)[1]
+    # Within a tenth of a side of the middle rows and columns are averaged.
+    rows, columns = np.abs(y + 41e-6) <= 32e-6, np.abs(x - 23e-6) <= 20e-6
+    assert 1 < rows.sum() < len(y) / 2
+    assert 1 < columns.sum() < len(x) / 2
+    for profile, place, along, wanted in (
+        (table.along_x, x - 23e-6, over[rows].mean(0), target.value[rows].mean(0)),
+        (table.along_y, y + 41e-6, over[:, columns].mean(1), target.value[:, columns].mean(1)),
+    ):
+        assert profile is not None
+        assert not profile.in_angles
+        np.testing.assert_allclose(profile.place_m, place, rtol=0, atol=1e-9)  # sines for tangents
+        np.testing.assert_allclose(profile.light, along, rtol=1e-3, atol=1e-4 * along.max())
+        np.testing.assert_allclose(profile.wanted, wanted, rtol=1e-9)
+    # Pixels of which no sample lies on an edge, by their samples one for one.
+    pixels: dict[tuple[float, float], list[tuple[float, bool]]] = {}
+    for (row, column), value in np.ndenumerate(over):
+        place = float(np.floor(y[row] / 6.9e-6)), float(np.floor(x[column] / 6.9e-6))
+        pixels.setdefault(place, []).append((value, bool(target.flat[row, column])))
+    whole = [np.mean([value for value, _ in one]) for one in pixels.values() if all(flat for _, flat in one)]
+    assert len(whole) > 20
+    assert table.pixel_contrast == pytest.approx(np.std(whole) / np.mean(whole), rel=exact)
+
+
+def test_the_words_and_rows_of_an_area(tmp_path: Path):
+    table, _ = light_of_a_slit(tmp_path)
+    at = np.linspace(-100e-6, 100e-6, 401)
+    along = [Profile(at, 1.0 * (np.abs(at) < half), 1.0 * (np.abs(at) < half)) for half in (40.25e-6, 70.25e-6)]
+    numbers = {"efficiency": 0.5, "contrast": 0.25, "pixel_contrast": 0.125, "zeroth_order": 0.01, "fresnel": 0.9}
+    told = replace(table, along_x=along[0], along_y=along[1], **numbers)
+    assert told.describe() == (
+        "rectangle: 50.00 % of the light (ceiling: none known), contrast 25.00 % (12.50 % on pixels), "
+        "80.5 x 140.5 um at half the light, 0th order 1.000 % (within the area); Fresnel loss of 10.0 % apart"
+    )
+    below, _ = light_of_a_slit(tmp_path, 'area.offset=["0 um", "-250 um"]')
+    assert "0th order 100.000 %; Fresnel" in below.describe()
+    assert "at half" not in replace(told, along_x=None).describe()
+    assert "at half" not in replace(told, along_y=None).describe()
+    assert "on pixels" not in replace(told, pixel_contrast=None).describe()
+    rows = told.to_csv().splitlines()
+    assert rows[:2] == ["axis,place_mm,light,wanted", "x,-0.1,0,0"]
+    assert [row[0] for row in rows[1:]] == ["x"] * 401 + ["y"] * 401
+    worse = replace(told, efficiency=0.4, contrast=0.2)
+    both = AreaTables((told, worse))
+    assert both.measures() == {"on_target": 0.4, "contrast": 0.25}
+    assert both.to_csv().splitlines()[:2] == ["area,axis,place_mm,light,wanted", "1,x,-0.1,0,0"]
+    assert both.to_csv().splitlines()[-1].startswith("2,y,0.1,")
+
+
+def test_the_wave_of_a_slit_is_a_sum_of_its_sincs(tmp_path: Path):
+    """Light in a flat wave, the phase off it, and the light of all cells in step, by sums in double precision."""
+    table, field = light_of_a_slit(tmp_path, "area.phase=flat")
+    target, found = table.target, table.wave
+    assert found is not None
+    wave = np.where(target.lit, np.sqrt(target.wanted), 0.0)
+    wave /= np.linalg.norm(wave)
+    assert found.share == pytest.approx(np.sum(wave * field) ** 2, rel=1e-4)  # single precision
+    # Fringes are in step with the wave or against it.
+    weight = wave[target.flat] ** 2
+    inside = np.sum((wave * field)[target.flat])
+    against = np.sum(weight[field[target.flat] * inside < 0]) / weight.sum()
+    assert 0.1 < against < 0.5
+    assert found.phase_rmse == pytest.approx(np.pi * np.sqrt(against), rel=1e-3)
+    grid = table.camera.grid
+    rows, columns = (
+        np.sqrt(4e-6 * np.ptp(sines[:2]) / 532e-9)
+        * np.sinc(sines * 4e-6 / 532e-9)
+        * np.exp(2j * np.pi * np.outer(at, sines) / 532e-9)
+        for sines, at in ((target.sines_y, grid.axis_m("y")), (target.sines_x, grid.axis_m("x")))
+    )
+    open_ = np.outer(np.abs(grid.axis_m("y")) < 124e-6, np.abs(grid.axis_m("x")) < 248e-6)
+    in_step = np.sum(np.abs(rows @ wave @ columns.T)[open_]) ** 2 / (124 * 62)
+    assert found.ceiling == pytest.approx(in_step, rel=1e-4)
+    assert found.share < found.ceiling
+
+
+@pytest.mark.parametrize(
+    ("shape", "width_m", "height_m", "inner_m", "places"),
+    [
+        ("rectangle", 300e-6, 200e-6, None, 52),
+        ("ellipse", 300e-6, 200e-6, None, 52),
+        ("ring", 500e-6, None, 200e-6, 104),
+        ("line", 300e-6, None, None, 26),
+    ],
+)
+def test_an_area_is_drawn_with_its_size_and_edges(
+    tmp_path: Path, shape: str, width_m: float, height_m: float | None, inner_m: float | None, places: int
+):
+    """Half its value on the border, from 90 to 13.5 % within an edge, and room for two edges around it."""
+    spec, edge_m = spec_of(tmp_path), 50e-6
+    camera = camera_from_spec(spec)
+    assert spec.areas
+    changes = {"shape": shape, "width_m": width_m, "height_m": height_m, "inner_m": inner_m}
+    area = spec.areas[0].model_copy(update={**changes, "edge_m": edge_m, "offset_m": (30e-6, -20e-6), "dark_m": 40e-6})
+    target = AreaTarget.of(area, camera, samples=12)
+    assert target.centre_m == (-20e-6, 30e-6)
+    y, x = camera.image_m(target.sines_y, 0.0)[0] + 20e-6, camera.image_m(0.0, target.sines_x)[1] - 30e-6
+    row, column = np.abs(y).argmin(), np.abs(x).argmin()
+    # Of directions up to 0.02: sines for tangents on a lattice of a fifteenth of an edge, and straight lines on it.
+    a_little = {"size": 1e-7, "edge": 0.01 * edge_m}
+    for place, along, size in ((y, target.value[:, column], target.size_m[0]), (x, target.value[row], width_m)):
+        ends, step = np.array([-1, 1]) * (size / 2 + 2 * edge_m), place[1] - place[0]
+        assert np.all((place[[0, -1]] - ends) * [-1, 1] >= 0)
+        assert np.all((place[[0, -1]] - ends) * [-1, 1] < step)
+        if size:
+            profile = Profile(place, along, along)
+            assert profile.size_m == pytest.approx(size, abs=a_little["size"])
+            assert profile.edge_m == pytest.approx(edge_m, abs=a_little["edge"])
+        else:
+            np.testing.assert_allclose(along, np.exp(-2 * (place / edge_m) ** 2), atol=0.01)
+    if inner_m is not None:
+        near = np.abs(x) < (width_m + inner_m) / 4
+        hole = Profile(x[near], 1 - target.value[row, near], x[near])
+        assert hole.size_m == pytest.approx(inner_m, abs=a_little["size"])
+    assert len(target.border[0]) == len(target.border[1]) == places
+    rows, columns = target.border
+    # Near the corners of a rectangle two edges meet.
+    assert np.sum(rows @ target.value * columns, axis=1) == pytest.approx(0.5, abs=0.02)
+    frame = (np.abs(y)[:, None] <= target.size_m[0] / 2 + 40e-6) & (np.abs(x) <= width_m / 2 + 40e-6)
+    np.testing.assert_array_equal(target.dark, frame & (target.value < 0.1))
+
+
+def test_light_is_judged_by_formulas(tmp_path: Path):
+    """Noise on the light wanted, with a frame that should be dark, against sums in double precision."""
+    spec, rng = spec_of(tmp_path, "area.dark=40 um", "area.edge=50 um"), np.random.default_rng(5)
+    assert spec.areas
+    target = AreaTarget.of(spec.areas[0], camera_from_spec(spec))
+    light = 1e-4 * (1.3 * target.value + rng.uniform(0, 0.4, target.value.shape))
+    flat, lit, even = target.value >= 0.9, target.value >= 0.135, (target.value >= 0.9) | target.dark
+    wanted = np.where(flat, 1.0, target.value)
+    over = light / (np.sum((wanted * light)[even]) / np.sum(wanted[even] ** 2))
+    edges = np.maximum(np.abs(over - wanted) - 0.1, 0)[lit & ~even]
+    border = np.sum(target.border[0] @ over * target.border[1], axis=1) - 0.5
+    contrast = np.sqrt(np.sum((over - wanted)[even] ** 2) / flat.sum())
+    misplaced = np.sqrt(np.mean(border**2) + np.sum(edges**2) / flat.sum())
+    found = eqx.filter_jit(AreaScore.judge)(AreaScore.of(target), jnp.asarray(light, jnp.float32))
+    assert [float(part) for part in found] == pytest.approx([light[lit].sum(), contrast, misplaced], rel=1e-4)  # single
+    loss = 1 - light[lit].sum() + 0.7 * np.hypot(contrast, misplaced)
+    assert float(found.loss(0.7)) == pytest.approx(loss, rel=1e-5)
+    # And where the phase is given: light on area and frame that is not in the wave, over what is.
+    given = AreaScore.of(replace(target, phase=rng.uniform(0, 6, light.shape)))
+    assert given.wave is not None
+    wave = np.asarray(given.wave, complex)
+    field = np.sqrt(light) * np.exp(1j * (np.angle(wave) + rng.normal(0, 0.5, light.shape)))
+    inside = abs(np.vdot(wave, field)) ** 2
+    contrast = np.sqrt(light[lit | target.dark].sum() / inside - 1)
+    found = eqx.filter_jit(AreaScore.judge_field)(given, jnp.asarray(field, jnp.complex64))
+    assert [float(part) for part in found] == pytest.approx([inside, contrast, 0], rel=1e-4)
+
+
+def test_the_worst_of_several_areas_counts_most(tmp_path: Path):
+    """The logarithm of the mean of exp(12 loss), of heights that begin again after a span."""
+    spec, rng = spec_of(tmp_path), np.random.default_rng(6)
+    camera = camera_from_spec(spec)
+    assert spec.areas
+    target = AreaTarget.of(spec.areas[0], camera)
+    problem = AreaProblem.of(target, camera)
+    phase = rng.uniform(0, 2 * np.pi, camera.grid.shape)
+    light = light_on(HeightOptic.of(camera, phase / (2 * np.pi * camera.waves_per_metre(532e-9))), target)
+    sets = AreaSet((problem,)), AreaSet((problem, replace(problem, turn=0.5))), AreaSet((problem, problem), span=7.0)
+    weights = np.array([0.2, 0.5])
+
+    @jax.jit
+    def found(phase: jax.Array) -> Any:
+        one, half, again = sets
+        single = [one.loss(phase, weight[None]) for weight in jnp.asarray(weights)]
+        return problem.light(phase), single, half.judge(2 * phase)[1], again.loss(phase + 14.0, jnp.asarray(weights))
+
+    seen, losses, half, both = found(jnp.asarray(phase, jnp.float32))
+    np.testing.assert_allclose(seen, light, rtol=1e-3, atol=1e-4 * light.max())  # single precision
+    assert float(half.efficiency) == pytest.approx(light[target.lit].sum(), rel=1e-4)
+    assert losses[1] - losses[0] > 0.1
+    # A phase of 20 in single precision.
+    assert float(both) == pytest.approx(np.log(np.mean(np.exp(12 * np.array(losses)))) / 12, rel=1e-4)
+
+
+def test_an_area_of_a_plane_moves_the_sensor_there(tmp_path: Path):
+    spec = spec_of(tmp_path)
+    camera = camera_from_spec(spec)
+    assert spec.areas
+    there = spec.areas[0].model_copy(update={"distance_m": 21e-3})
+    assert in_plane(there, camera).defocus_m == pytest.approx(1e-3)
+    assert in_plane(there, camera).sensor_distance_m == pytest.approx(21e-3)
+    bare = replace(camera, focal_length_m=np.inf, distance_m=30e-3)
+    assert in_plane(there, bare).sensor_distance_m == 21e-3
+    assert in_plane(spec.areas[0], bare) is bare
 
 
 def test_power_is_that_of_the_beam(tmp_path: Path):

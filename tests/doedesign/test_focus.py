@@ -11,13 +11,16 @@ from scipy.special import j0
 import doedesign
 import doedesign.optimization as optimization
 from doedesign.build import camera_from_spec
-from doedesign.focus.depth import focus_of_design, focus_table
+from doedesign.focus.depth import FocusTable, focus_of_design, focus_table
 from doedesign.focus.design import FocusTask
 from doedesign.focus.foci import Foci
+from doedesign.focus.problem import BESIDE, ring_count, ring_numbers
 from doedesign.prediction import on_target
 from doedesign.runs.level_maps import open_design
+from fab.aperture import RectangularAperture
 from fab.errors import InputError
 from fab.process import Process, Variation
+from sim.camera import Colour
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.surface import as_fabricated
@@ -341,3 +344,103 @@ def test_light_beside_a_focus_counts_in_its_loss(spec_file: Path):
     assert table.loss == pytest.approx(np.log(4), abs=0.01)  # 1e-12 of blur, which keeps a root smooth
     table = replace(table, light=np.stack([np.ones_like(narrow), one_sided])[None])
     assert table.loss == pytest.approx(np.log(4) + 5000 * 0.75 * 0.58**2, rel=1e-5)  # single precision
+
+
+def table_of_a_slit(spec_file: Path) -> FocusTable:
+    """Light of a parabola of 40 mm at 532 nm behind a slit, in a colour of two lines of which it is made for one."""
+    camera = camera_from_spec(doedesign.load_spec(spec_file, ['sensor.distance="40 mm"', 'focus.distances=["40 mm"]']))
+    colour = Colour("two", (532e-9, 640e-9), (0.7, 0.3))
+    camera = replace(camera, colours=(colour,), aperture=RectangularAperture((160e-6, 240e-6)))
+    square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x") ** 2
+    height = -square / (2 * 40e-3 * 532e-9 * camera.waves_per_metre(532e-9))
+    foci = Foci(np.array([40e-3, 39e-3]), np.array([100e-6, 120e-6]), np.array([0.75, 0.25]), np.array([0, 0]))
+    return focus_table(HeightOptic.of(camera, np.float32(height)), foci)
+
+
+def test_the_table_of_a_slit_is_that_of_integrals_along_its_sides(spec_file: Path):
+    """Fresnel's integral is a product of one along each side; the rim sends light off by 0.2 degrees at most."""
+    table = table_of_a_slit(spec_file)
+    camera, sides = table.camera, (160e-6, 240e-6)
+    factor = np.array([weight * camera.transmission(wave) for weight, wave in ((0.7, 532e-9), (0.3, 640e-9))])
+    for k, (distance, width) in enumerate(zip((40e-3, 39e-3), (100e-6, 120e-6), strict=True)):
+        light, axis, ideal = np.zeros((2, 129)), 0.0, 0.0
+        for wave, share in zip((532e-9, 640e-9), factor / factor.sum(), strict=True):
+            lens = camera.waves_per_metre(wave) / camera.waves_per_metre(532e-9) / 532e-9 / 40e-3
+            fields = []
+            for side in sides:
+                at = (np.arange(2000) + 0.5) / 2000 * side - side / 2
+                bend = np.exp(1j * np.pi * at**2 * (1 / wave / distance - lens))
+                turns = np.outer(table.places * width / wave / distance, at)
+                fields.append(np.exp(-2j * np.pi * turns) @ bend * (side / 2000))
+            over = share / (wave * distance) ** 2 / np.prod(sides)
+            light += over * np.abs([fields[0] * fields[1][64], fields[1] * fields[0][64]]) ** 2
+            axis += over * abs(fields[0][64] * fields[1][64]) ** 2
+            ideal += over * np.prod(sides) ** 2
+        # The sinc of a cell at the rim: 0.011 waves across it, 4e-4 of its light, and of obliquity less.
+        np.testing.assert_allclose(table.light[k], light / axis, rtol=0, atol=1e-3)
+        assert table.strength[k] == pytest.approx(axis / ideal, rel=1e-3)
+        places, both = table.places[64:81] * width, light[:, 64:81].mean(0)
+        inside = np.sum((2 * np.pi * places * both)[:-1] + (2 * np.pi * places * both)[1:]) * width / 64
+        assert table.share[k] == pytest.approx(inside, rel=1e-3)
+        widths = [np.interp(-0.5, -along[64:] / axis, table.places[64:]) * 2 * width for along in light]
+        assert table.width_m[k] == pytest.approx(widths, rel=2e-3)
+    assert table.worst == pytest.approx((table.width_m / np.array([[100e-6], [120e-6]])).max())
+    at = (np.arange(2000) + 0.5) / 2000 - 0.5
+    straight_on = [np.mean(np.exp(-1j * np.pi * (at * side) ** 2 / 532e-9 / 40e-3)) for side in sides]
+    assert table.zeroth_order == pytest.approx(np.prod(np.abs(straight_on)) ** 2, rel=1e-3)
+    assert table.measures()["on_target"] == pytest.approx(0.75 * table.share[0] + 0.25 * table.share[1])
+
+
+def test_words_and_rows_of_foci(spec_file: Path):
+    table = table_of_a_slit(spec_file)
+    lost = np.stack([table.light[0], np.ones((2, 129))])  # as bright as the axis all along
+    told = replace(table, light=lost, strength=np.array([0.5, 0.25]), share=np.array([0.4, 0.2]), zeroth_order=0.0125)
+    told = replace(told, fresnel=0.9)
+    wide_y, wide_x = table.width_m[0] * 1e6
+    assert told.width_m[0] == pytest.approx(table.width_m[0])
+    assert np.isinf(told.width_m[1]).all()
+    assert told.describe() == (
+        f"focus {max(wide_y, wide_x):.4g} um at 40 mm, ? um at 39 mm wide; at worst ? times the width wanted, of 2 "
+        "looked at; 25 to 50 % of an ideal lens's light on the axis (ceiling: none known), 0th order 1.25 %; Fresnel "
+        "loss of 10.0 % apart"
+    )
+    assert told.to_csv().splitlines()[1:] == [
+        f"40,two,100,{wide_y:.6g},{wide_x:.6g},0.5,0.4",
+        "39,two,120,inf,inf,0.25,0.2",
+    ]
+    assert told.measures() == {"on_target": pytest.approx(0.35), "focus_width": 10.0}
+    rows = told.summary()["foci"]
+    assert rows[0]["width_y_m"] == pytest.approx(wide_y * 1e-6)
+    assert (rows[1]["width_y_m"], rows[1]["width_x_m"], rows[1]["strength"]) == (None, None, 0.25)
+    assert told.summary()["focus_width"] is None
+
+
+def test_usual_widths_are_those_of_an_ideal_lens_or_of_rings(spec_file: Path):
+    """1.15 times 1.029 lambda z / D, z the way to the rim; no finer than cells make it, 1.029 times two of them."""
+    spec = doedesign.load_spec(spec_file, [])
+    camera = camera_from_spec(spec)
+    assert spec.focus is not None
+    foci = Foci.shown(spec.focus.model_copy(update={"distances_m": (4e-3, 1e-4)}), camera)
+    lens = 1.029 * 532e-9 * np.hypot(4e-3, camera.aperture_m / 2) / camera.aperture_m
+    assert foci.width_m == pytest.approx([1.15 * lens, 1.15 * 1.029 * 2 * 2e-6], rel=1e-3)
+    assert foci.weight == pytest.approx([0.5, 0.5])
+    way = {"distances_m": (2e-3, 40e-3), "through": True, "widths_m": (6e-6, 70e-6)}
+    foci = Foci.shown(spec.focus.model_copy(update=way), camera)
+    power = np.log(70 / 6) / np.log(20)  # so that both ends have their widths
+    assert foci.width_m == pytest.approx(6e-6 * (foci.distance_m / 2e-3) ** power, rel=1e-9)
+    assert foci.weight[1:-1] == pytest.approx(1 / 60, rel=1e-9)  # distances in equal ratios
+
+
+def test_rings_reach_a_cell_beyond_the_rim(spec_file: Path):
+    camera = camera_from_spec(doedesign.load_spec(spec_file, []))
+    count = ring_count(camera)
+    assert (count - 1) / 3 < camera.aperture_m / 2 / 2e-6 + 1 <= count / 3  # three to a cell
+    numbers = ring_numbers(camera)
+    radius = np.hypot(camera.grid.axis_m("y")[:, None], camera.grid.axis_m("x")) / 2e-6 * 3
+    near = numbers < count - 1
+    assert np.all((numbers <= radius) & ((radius < numbers + 1) | ~near))
+    assert numbers.max() == count - 1
+    # The loss of a report looks where the search does, beyond half the width wanted.
+    table = table_of_a_slit(spec_file)
+    assert np.isin(BESIDE, table.places).all()
+    assert (min(BESIDE), max(BESIDE)) == (0.5, 1.0)

@@ -9,7 +9,7 @@ from doedesign.build import process_from_spec
 from doedesign.optimization import optimize
 from doedesign.spec import Spec, load_spec
 from doedesign.spec.targets.arrangements import grid_orders
-from doedesign.spots import design
+from doedesign.spots import design, plate_sums
 from doedesign.spots.design import SpotTask, orders_of_design
 from doedesign.spots.plates import SpotPlates, plates_of
 from doedesign.spots.spots import Spots, shares_of
@@ -29,8 +29,8 @@ MADE = "spots.uniformity_as_fabricated=1.5"
 
 
 def problem(shape: tuple[int, int], count: tuple[int, int], levels: Levels) -> SpotProblem:
-    orders, step = grid_orders(count), 1 / (max(shape) * PITCH_M)
-    spots = Spots(orders * step, shares_of((), len(orders)), orders, (step, step))
+    orders, steps = grid_orders(count), (1 / (shape[0] * PITCH_M), 1 / (shape[1] * PITCH_M))
+    spots = Spots(orders * np.array(steps), shares_of((), len(orders)), orders, steps)
     staircase = Staircase.of(2 * np.pi * WAVES_PER_M * levels.heights_m())
     return SpotProblem.on(Grid(shape, PITCH_M), np.ones(shape, np.float32), spots, staircase)
 
@@ -113,6 +113,35 @@ def test_rows_and_columns_are_alike():
     found = plates(square, levels, Variation(overlay_y_m=y, overlay_x_m=x)).amplitudes(level)[:, 0]
     turned = plates(square, levels, Variation(overlay_y_m=x, overlay_x_m=y)).amplitudes(level.T.copy())[:, 0]
     assert np.abs(found.reshape(3, 3) - turned.reshape(3, 3).T).max() < 1e-6
+
+
+@pytest.mark.parametrize("shape", [(5, 6), (1, 8), (7, 1), (2, 3)])
+def test_a_cell_takes_its_light_and_that_of_its_walls_along(shape: tuple[int, int]):
+    """What an exchange adds and takes away for one cell, against the sum of all cells and walls, at every cell."""
+    levels, rng = Levels(8, 144e-9), np.random.default_rng(7)
+    cells = problem(shape, (3 if shape[1] > 1 else 1, 3 if shape[0] > 1 else 1), levels)
+    errors = Variation(overlay_x_m=(0.4e-6, -0.3e-6, 0.2e-6), overlay_y_m=(-0.5e-6, 0.1e-6, 0.6e-6))
+    made = plates(cells, levels, errors, Variation(common_cd_bias_m=0.3e-6))
+    level = rng.integers(0, 8, shape).astype(np.uint8)
+    light = made.amplitudes(level)
+    for y, x in np.ndindex(shape):
+        other = level.copy()
+        other[y, x] = (level[y, x] + rng.integers(1, 8)) % 8
+        found = light.copy()
+        for sign, own in ((-1.0, int(level[y, x])), (1.0, int(other[y, x]))):
+            plate_sums._add_cell.py_func(found, level, y, x, own, sign, *made.tables)
+        np.testing.assert_allclose(found, made.amplitudes(other), rtol=0, atol=1e-12)  # double precision
+
+
+def test_the_merit_of_plates_is_that_of_its_formula():
+    """Light of 2 spots with shares of 1 to 3 on 3 plates: their mean sum, and fourth powers of what is unequal."""
+    rng, shares = np.random.default_rng(8), np.array([0.25, 0.75])
+    light = rng.normal(size=(2, 3)) + 1j * rng.normal(size=(2, 3))
+    power = np.abs(light) ** 2
+    off = power / shares[:, None] / (power / shares[:, None]).mean(0) - 1
+    wanted = power.sum() / 3 - 0.6 * 1.4 * np.mean(off**4) ** 0.25
+    assert plate_sums.merit_of.py_func(light, shares, 0.6) == pytest.approx(wanted, rel=1e-12)
+    assert np.isfinite(plate_sums.merit_of.py_func(0 * light, shares, 0.6))
 
 
 def test_plates_come_in_opposite_pairs():

@@ -10,7 +10,7 @@ import pytest
 from doedesign.spec.targets.arrangements import grid_orders, hexagonal_places, ring_places
 from doedesign.spec.targets.spots import open_periods
 from doedesign.spots import search
-from doedesign.spots.exchange import exchange
+from doedesign.spots.exchange import _merit, cooled, exchange, offered, offers
 from doedesign.spots.orders import ceiling_of, order_table
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, shares_of
@@ -117,6 +117,7 @@ def test_the_search_finds_the_known_optimum(count: tuple[int, int], known: float
     found = search_phases(spots, points, starts=40, seed=0, uniformity=1.0)
     # Some two dozen points stand for a period: 0.6 % for two beams, whose phase jumps.
     assert found.efficiency == pytest.approx(known, abs=6e-3)
+    assert ceiling_of(count, 10**5).efficiency == pytest.approx(known, abs=5e-5)  # four digits
 
 
 def test_the_search_goes_axis_by_axis_where_orders_are_many(monkeypatch: pytest.MonkeyPatch):
@@ -172,6 +173,68 @@ def test_exchange_finds_dammanns_grating_and_never_spoils():
     for level, light in zip(found[:3], lights, strict=False):
         again = exchange(task, level, sweeps=20, seed=9, uniformity=0.0, heat=0.05)
         assert task.light(again).efficiency >= light.efficiency * (1 - 1e-6)
+
+
+def test_offers_are_of_levels_of_neighbours_or_of_others():
+    level = np.random.default_rng(5).integers(0, 7, (3, 4)).astype(np.uint8)
+    neighbours = [np.roll(level, step, axis) for axis in (0, 1) for step in (-1, 1)]  # below, above, behind, before
+    for y, x in np.ndindex(level.shape):
+        assert [offered(level, y, x, 0, side, 7) for side in range(4)] == [each[y, x] for each in neighbours]
+        assert [offered(level, y, x, k, 0, 7) for k in range(1, 7)] == [(level[y, x] + k) % 7 for k in range(1, 7)]
+    order, chance, others, sides = offers(np.random.default_rng(6), 40000, 7, 0.3)
+    assert np.array_equal(np.sort(order), np.arange(40000))
+    assert 0 <= chance.min() < 0.01 < 0.99 < chance.max() < 1
+    # Half of the others are the next level up or down, the rest any: of 40 000, within five standard deviations.
+    wanted = np.array([0.7, *(0.3 * (0.25 * np.isin(k, (1, 6)) + 0.5 / 6) for k in range(1, 7))])
+    assert np.bincount(others, minlength=7) / 40000 == pytest.approx(wanted, abs=5 * (0.3 * 0.7 / 40000) ** 0.5)
+    assert np.bincount(sides) / 40000 == pytest.approx(0.25, abs=5 * (0.25 * 0.75 / 40000) ** 0.5)
+    assert set(offers(np.random.default_rng(6), 1000, 2, 0.3).others) == {0, 1}
+    assert [cooled(2.0, sweep, 10) for sweep in (0, 7, 9)] == pytest.approx([2.0, 0.0, 0.0])
+    assert cooled(2.0, 3, 10) == pytest.approx(2.0 * (4 / 7) ** 2)
+
+
+def test_the_merit_of_an_exchange_is_that_of_its_formula():
+    """Four spots of unequal shares: their sum, or the light in a wave, less what fourth powers of deviations say."""
+    rng, shares = np.random.default_rng(7), shares_of((1, 2, 3, 4), 4)
+    light = 0.4 * (rng.normal(size=4) + 1j * rng.normal(size=4))
+    power = np.abs(light) ** 2
+    uneven = 1.4 * np.mean((power / shares / np.mean(power / shares) - 1) ** 4) ** 0.25
+    none, wave = np.zeros(0, complex), np.sqrt(shares) * np.exp(1j * rng.uniform(0, 6, 4))
+    assert _merit(light, shares, none, 0.6) == pytest.approx(power.sum() - 0.6 * uneven, rel=1e-12)
+    in_wave = abs(np.vdot(wave, light)) ** 2
+    assert _merit(light, shares, wave.conj(), 0.6) == pytest.approx(in_wave - 0.6 * uneven, rel=1e-12)
+    assert np.isfinite(_merit(0 * light, shares, none, 0.6))
+
+
+def test_an_exchange_without_heat_takes_what_is_better_and_nothing_else():
+    task = problem((3, 1), 32, 4)
+    begun = np.random.default_rng(8).integers(0, 4, (1, 32)).astype(np.uint8)
+    merits, none = [], np.zeros(0, complex)
+    for sweeps in range(6):
+        level = exchange(task, begun, sweeps=sweeps, seed=1, uniformity=0.5, heat=0.0)
+        merits.append(_merit(task.amplitudes(level).astype(complex), task.spots.shares, none, 0.5))
+    assert (np.diff(merits) > -1e-6).all()  # single precision
+    assert merits[1] > merits[0] + 0.1
+    assert merits[-1] > merits[1]
+
+
+@pytest.mark.parametrize(("count", "shape"), [((3, 1), (1, 16)), ((1, 3), (16, 1)), ((3, 3), (16, 16))])
+def test_a_coarser_cell_has_the_same_orders(count: tuple[int, int], shape: tuple[int, int]):
+    """Half as many cells, twice as wide, along every axis that has several: levels that both have are the same DOE."""
+    fine = problem(count, 16, 4)
+    coarse = fine.coarser()
+    assert coarse.grid.shape == tuple(n // 2 if n > 1 else 1 for n in shape)
+    assert coarse.grid.pitch_m == 2 * PITCH_M
+    level = np.random.default_rng(4).integers(0, 4, coarse.grid.shape).astype(np.uint8)
+    drawn = np.kron(level, np.ones([2 if n > 1 else 1 for n in shape], np.uint8))
+    np.testing.assert_allclose(coarse.amplitudes(level), fine.amplitudes(drawn), rtol=0, atol=1e-6)  # single precision
+
+
+def test_spots_without_light_are_not_uneven():
+    assert spot_light(np.zeros(3), np.full(3, 1 / 3)) == (0.0, 0.0)
+    assert spot_light(np.array([0.1, 0.3]), np.array([0.25, 0.75])) == pytest.approx((0.4, 0.0))
+    assert spot_light(np.array([0.1, 0.3]), np.array([0.5, 0.5])) == pytest.approx((0.4, 0.5))
+    assert spot_light(np.array([0.1, 0.3]), np.array([0.5, 0.5])).merit(0.6) == pytest.approx(0.1)
 
 
 def test_weights_are_obeyed():
@@ -272,6 +335,18 @@ def test_ceilings_name_their_source():
         ceiling_of((7, 1), 8, equal=False),
     ):
         assert (other.efficiency, other.source) == (None, "none known")
+
+
+def test_ceilings_are_known_of_rows_and_squares():
+    """The phases of two rows, one along each axis, add up to a square with the product of what each has."""
+    rows, squares = [(n, 1) for n in (2, 3, 5, 6, 7, 8, 9)], [(n, n) for n in range(2, 10)]
+    known = {(x, y): ceiling_of((x, y), 10**5).efficiency for x in range(1, 11) for y in range(1, x + 1)}
+    assert [count for count, efficiency in known.items() if efficiency is not None] == sorted(rows + squares)
+    for count, _ in rows:
+        row, square = known[count, 1], known[count, count]
+        assert row is not None
+        assert square is not None
+        assert row**2 - 1e-4 <= square < 1  # four digits
 
 
 def test_a_picture_of_a_table():

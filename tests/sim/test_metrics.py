@@ -8,7 +8,7 @@ import pytest
 from bench.reference import make_camera, wrapped_map
 from fab.aperture import MaskAperture
 from fab.grid import Grid
-from sim.camera import Colour
+from sim.camera import Camera, Colour
 from sim.metrics import (
     MetricInputs,
     airy_radius_m,
@@ -18,6 +18,7 @@ from sim.metrics import (
     energy_within,
     in_parts,
     mean_wavelength_m,
+    near_and_far,
     participation,
     radius_map_m,
     ring_to_disc,
@@ -73,6 +74,34 @@ def test_ring_and_disc_share_the_window():
     dark = np.zeros((64, 64), np.float32)
     dark[0, 0] = 1
     assert ring_to_disc(dark, CAMERA, depth).ratio == np.inf
+
+
+@pytest.mark.parametrize("light", [0.0, 0.75])
+def test_ring_and_disc_of_a_traced_psf_are_those_of_its_numbers(light: float):
+    """A corner with a quarter of the light, and the middle with what is left of it; without it there is no disc."""
+    image = np.zeros((64, 64), np.float32)
+    image[0, 0], image[32, 32] = 0.25, light
+    depth = 0.6e-3 * 1.08e-3 / (40 * 1.85e-6)
+    traced, known = (np.asarray(found(image, CAMERA, depth)[:3]) for found in (_traced_ring_to_disc, ring_to_disc))
+    np.testing.assert_allclose(traced, known, rtol=1e-6)
+    assert known[0] == (pytest.approx(1 / 3) if light else np.inf)
+
+
+def _traced_ring_to_disc(image: np.ndarray, camera: Camera, depth_m: float) -> tuple[jax.Array, ...]:
+    return jax.jit(lambda one: tuple(map(jnp.asarray, ring_to_disc(one, camera, depth_m)[:3])))(image)
+
+
+def test_near_depths_are_those_whose_disc_is_wider_than_the_far_spot():
+    """The disc of the aperture's radius R in the focal plane, R f / z, against the spot of the longest wavelength."""
+    colours = tuple(Colour(str(wave), (wave,), (1.0,)) for wave in (4e-7, 7e-7, 5e-7))
+    camera = dataclasses.replace(CAMERA, colours=colours)
+    border = 0.3e-3 * 1.08e-3 / spot_radius_m(camera, 7e-7)
+    depths_m = (1.001 * border, 0.999 * border, np.inf, 0.5 * border)
+    near, far = near_and_far(camera, depths_m)
+    assert near == (0.999 * border, 0.5 * border)
+    assert far == (1.001 * border, np.inf)
+    bare = dataclasses.replace(camera, focal_length_m=np.inf, distance_m=2e-3)
+    assert near_and_far(bare, depths_m) == ((), depths_m)
 
 
 def test_participation_of_equal_pixels():
