@@ -110,8 +110,36 @@ class SpotTask:
             problem.spots, points, starts=table.starts, seed=self.spec.optimize.seed, uniformity=table.uniformity,
             staircases=looked_at, keep=_TRIED,
         )  # fmt: skip
-        tried = [self._after(SpotState(waves, waves, -np.inf, 0), _TRIAL_STEPS) for waves in found.waves]
+        starts = [*found.waves, *self._crossed_rows()]
+        tried = [self._after(SpotState(waves, waves, -np.inf, 0), _TRIAL_STEPS) for waves in starts]
         return max(tried, key=lambda state: state.merit)._replace(step=0)
+
+    def _crossed_rows(self) -> list[WaveSet]:
+        """For a grid of equal spots in one colour, the sums of the best phases of a row and of a column.
+
+        The phase of such a plate is the sum of two that each part light along one axis, and its efficiency their
+        product: of nine by nine more than a search of all phases finds.
+        """
+        problem, table = self.problem, self.table
+        if isinstance(problem, SharedProblem) or table.arrangement != "grid" or problem.spots.lattice_per_m is None:
+            return []
+        assert table.count is not None
+        assert problem.spots.orders is not None
+        if min(table.count) == 1 or table.weights:
+            return []
+        seed, rows = self.spec.optimize.seed, []
+        for axis, count in enumerate(reversed(table.count)):
+            orders = grid_orders((1, count) if axis == 0 else (count, 1))
+            waves = orders * np.array(problem.spots.lattice_per_m)
+            row = Spots(waves, shares_of((), count), orders, problem.spots.lattice_per_m)
+            points = search_points(row, seed, problem.grid.extent_m)
+            found = search_phases(row, points, starts=table.starts, seed=seed, uniformity=table.uniformity, keep=2)
+            rows.append(found.waves)
+        return [
+            WaveSet(np.outer(y.weights, x.weights).ravel(), np.add.outer(y.phases, x.phases).ravel())
+            for y in rows[0]
+            for x in rows[1]
+        ]
 
     @property
     def template(self) -> list[np.ndarray]:
