@@ -63,8 +63,10 @@ def on_target(
         return focus_of_design(design, doe)
     if design.spec.spots is not None:
         from doedesign.spots.design import orders_of_design
+        from doedesign.spots.orders import OrderTables
 
-        return orders_of_design(design, doe)
+        spots = orders_of_design(design, doe)
+        return spots[0] if len(spots) == 1 else OrderTables(spots)
     from doedesign.areas.shape import AreaTables, areas_of_design
 
     tables = areas_of_design(design, doe)

@@ -62,7 +62,7 @@ def design_of(splitter: str, name: str, process: str, folder: Path, more: Sequen
 def uniformity_errors(design: Design, process: str, draws: int) -> tuple[np.ndarray, np.ndarray]:
     """Efficiency and uniformity error of so many plates of a stock process."""
     tables = [
-        orders_of_design(design, design.fabricated(process, seed=SEED, draw=f"normal/{number}"))
+        orders_of_design(design, design.fabricated(process, seed=SEED, draw=f"normal/{number}"))[0]
         for number in range(draws)
     ]
     return np.array([one.total for one in tables]), np.array([one.uniformity_error for one in tables])
@@ -104,7 +104,7 @@ def run(draws: int, processes: Sequence[str], out: Path, more: Sequence[str] = (
     for splitter in SPLITTERS:
         for name in DESIGNS:
             design = design_of(splitter, name, processes[0], out, more)
-            drawn = orders_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
+            (drawn,) = orders_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
             for process in processes:
                 light, unequal = uniformity_errors(design, process, draws)
                 errors[splitter, name, process] = unequal

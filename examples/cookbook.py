@@ -52,7 +52,7 @@ def designed(name: str, **changes: Any) -> dd.Design:
 
 # %%
 splitter = designed("splitter", steps=40)
-orders_of_design(splitter, splitter.as_optic()).plot()
+orders_of_design(splitter, splitter.as_optic())[0].plot()
 # %% [markdown]
 # ## Orders of a unit cell: `fan_out`
 #
@@ -60,7 +60,7 @@ orders_of_design(splitter, splitter.as_optic()).plot()
 
 # %%
 fan_out = designed("fan_out", steps=20, spots__count=[3, 3])
-orders_of_design(fan_out, fan_out.as_optic()).plot()
+orders_of_design(fan_out, fan_out.as_optic())[0].plot()
 # %% [markdown]
 # ## Even light: `diffuser`, `top_hat`, `colours`
 #

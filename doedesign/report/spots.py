@@ -9,10 +9,12 @@ from fab.figure import FAINT, INK, LINE, MARK, panels
 from sim.plots.places import label_places
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-    from doedesign.spots.orders import OrderTable, OrderTables
+    from doedesign.spots.orders import OrderTable
 
 _LABELLED = 40  # bars that still have room for their numbers
 
@@ -24,13 +26,12 @@ def plot_orders(table: "OrderTable", ax: "Axes | None" = None) -> "FigureBase":
     return figure
 
 
-def plot_colours(tables: "OrderTables", ax: "Axes | None" = None) -> "FigureBase":
+def plot_colours(tables: "Sequence[OrderTable]", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the spots of several colours below each other, as `plot_orders` does each."""
-    count = len(tables.tables)
-    with panels(ax, (8.6, 4.1 * count + 0.35), "Spots of every colour", _note(tables.tables[0])) as figure:
-        parts = figure.subfigures(count, 1, squeeze=False)[:, 0]
-        for name, table, part in zip(tables.colours, tables.tables, parts, strict=True):
-            part.suptitle(f"{name}: {_title(table)}", x=0.01, ha="left", parse_math=False)
+    with panels(ax, (8.6, 4.1 * len(tables) + 0.35), "Spots of every colour", _note(*tables)) as figure:
+        parts = figure.subfigures(len(tables), 1, squeeze=False)[:, 0]
+        for table, part in zip(tables, parts, strict=True):
+            part.suptitle(f"{table.colour}: {_title(table)}", x=0.01, ha="left", parse_math=False)
             _draw(table, part)
     return figure
 
@@ -43,13 +44,14 @@ def _title(table: "OrderTable") -> str:
     )
 
 
-def _note(table: "OrderTable") -> str:
+def _note(*tables: "OrderTable") -> str:
     """What the shares are of, and the ceiling."""
-    bound = table.ceiling
+    bound = tables[0].ceiling
     ceiling = "No ceiling is known."
     if bound.efficiency is not None:
         ceiling = f"Ceiling {100 * bound.efficiency:.1f} %: {bound.source}."
-    lost = f"{100 * (1 - table.fresnel):.1f} % that faces reflect"
+    least, most = (f"{100 * (1 - side(one.fresnel for one in tables)):.1f}" for side in (max, min))
+    lost = f"{least}{'' if least == most else f' to {most}'} % that faces reflect"
     return f"Shares of the incident light; {lost} are left out. {ceiling}"
 
 

@@ -14,7 +14,7 @@ from doedesign.spec import Spec
 from doedesign.spec.targets.arrangements import grid_orders
 from doedesign.spec.targets.spots import MOST_CELLS, SpotsSpec, places_of
 from doedesign.spots.exchange import exchange
-from doedesign.spots.orders import OrderTable, OrderTables, order_table
+from doedesign.spots.orders import OrderTable, order_table
 from doedesign.spots.plates import SpotPlates, plates_of
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, shares_of
@@ -307,19 +307,19 @@ def wavelength_of(camera: Camera, colour: int) -> float:
     return next(line.wavelength_m for line in camera.lines if line.colour == colour)
 
 
-def orders_of_design(design: Design, doe: CellOptic) -> OrderTable | OrderTables:
-    """Table of the spots of a design's spec, as drawn or as fabricated; one for each of several colours."""
+def orders_of_design(design: Design, doe: CellOptic) -> tuple[OrderTable, ...]:
+    """Tables of the spots of a design's spec, one for each colour, of the design as drawn or as fabricated."""
     assert design.spec is not None
-    table, camera = design.spec.spots, design.camera
+    table, camera, levels = design.spec.spots, design.camera, design.levels.count
     assert table is not None
-    numbers = colour_numbers(table, camera)
-    found = tuple(
+
+    return tuple(
         order_table(
-            doe, spots_from_spec(table, camera, number), colour=number, period_m=table.period_m, count=table.count,
-            levels=design.levels.count,
-        ) for number in numbers
+            doe, spots_from_spec(table, camera, colour), period_m=table.period_m, count=table.count, levels=levels,
+            colour=colour,
+        )
+        for colour in colour_numbers(table, camera)
     )  # fmt: skip
-    return found[0] if len(found) == 1 else OrderTables(found, tuple(camera.colours[one].name for one in numbers))
 
 
 def unit_cell(table: SpotsSpec, camera: Camera) -> Grid:

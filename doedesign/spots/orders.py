@@ -101,6 +101,7 @@ class OrderTable:
         phase_errors: `[spot]` phases less those that are given, radians, after the best common one; None where free.
         wave: how much light is in the wave of the phases that are given; None where they are free.
         zeroth_order_wanted: whether a spot lies where light goes straight on, so that the 0th order is no leakage.
+        colour: name of the colour that was looked at.
     """
 
     spots: Spots
@@ -115,6 +116,7 @@ class OrderTable:
     phase_errors: Float[np.ndarray, " m"] | None = None
     wave: WaveShare | None = None
     zeroth_order_wanted: bool = False
+    colour: str = ""
 
     @property
     def total(self) -> float:
@@ -210,11 +212,9 @@ class OrderTables:
 
     Attributes:
         tables: one for each colour.
-        colours: their names.
     """
 
     tables: tuple[OrderTable, ...]
-    colours: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -223,7 +223,7 @@ class OrderTables:
 
     def summary(self) -> list[dict[str, Any]]:
         """All numbers of every colour, for metrics."""
-        return [{"colour": name, **one.summary()} for name, one in zip(self.colours, self.tables, strict=True)]
+        return [{"colour": one.colour, **one.summary()} for one in self.tables]
 
     def measures(self) -> dict[str, float]:
         """Numbers that a tolerance study follows: those of the worst colour."""
@@ -234,21 +234,21 @@ class OrderTables:
 
     def describe(self) -> str:
         """A line for every colour."""
-        return "\n".join(f"{name}: {one.describe()}" for name, one in zip(self.colours, self.tables, strict=True))
+        return "\n".join(f"{one.colour}: {one.describe()}" for one in self.tables)
 
     def to_csv(self) -> str:
         """The tables of `OrderTable.to_csv`, every line after the name of its colour."""
         head, lines = "", []
-        for name, one in zip(self.colours, self.tables, strict=True):
+        for one in self.tables:
             head, *rows = one.to_csv().splitlines()
-            lines += [f"{name},{row}" for row in rows]
+            lines += [f"{one.colour},{row}" for row in rows]
         return "\n".join([f"colour,{head}", *lines]) + "\n"
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the spots of every colour below each other; on `ax`, or on a new figure."""
         from doedesign.report.spots import plot_colours
 
-        return plot_colours(self, ax)
+        return plot_colours(self.tables, ax)
 
 
 def order_table(
@@ -307,6 +307,7 @@ def order_table(
         errors,
         wave,
         bool(np.any(np.hypot(*(spots.waves_per_m * camera.opening.widest_m).T) < _AT_THE_ZEROTH)),
+        camera.colours[colour].name,
     )
 
 

@@ -173,11 +173,12 @@ def test_an_exchange_never_loses_and_repeats_itself():
     assert unequal == pytest.approx((over.max(axis=0) - over.min(axis=0)) / (over.max(axis=0) + over.min(axis=0)))
 
 
-def cell_of(spec: Spec) -> tuple[SpotTask, np.ndarray]:
+def cell_of(spec: Spec) -> tuple[SpotTask, SpotProblem, np.ndarray]:
     """Task of a spec with a row of orders, and the unit cell that is designed."""
     task = SpotTask.from_spec(spec)
+    assert isinstance(task.problem, SpotProblem)
     level = optimize(spec).level_map.level
-    return task, level[level.shape[0] // 2, : task.problem.grid.shape[1]][None].copy()
+    return task, task.problem, level[level.shape[0] // 2, : task.problem.grid.shape[1]][None].copy()
 
 
 @pytest.mark.slow
@@ -188,11 +189,11 @@ def test_spots_stay_more_equal_on_plates_that_no_step_has_seen(tmp_path: Path, m
     unseen, found = None, []
     for changes in (ROW, (*ROW, MADE)):
         spec = spec_of(tmp_path, *changes)
-        task, cell = cell_of(spec)
+        task, own, cell = cell_of(spec)
         process = process_from_spec(spec.process)
         rate = task.camera.waves_per_metre(task.camera.lines[0].wavelength_m)
         unseen = unseen or plates_of(process, 400, 99)
-        of = SpotPlates.of(task.problem, process, rate, unseen)
+        of = SpotPlates.of(own, process, rate, unseen)
         light = np.abs(of.amplitudes(cell)) ** 2
         found.append((np.percentile(of.uniformity_errors(cell), 95), light.sum(axis=0).mean()))
     (nominal, light), (kept, kept_light) = found
@@ -204,18 +205,18 @@ def test_spots_stay_more_equal_on_plates_that_no_step_has_seen(tmp_path: Path, m
 def test_it_agrees_with_the_model_of_the_process(tmp_path: Path):
     """`sim.surface` cuts cells into pieces and keeps their moments; straight walls, so nothing is left out here."""
     spec = spec_of(tmp_path, *ROW)
-    task, cell = cell_of(spec)
+    task, own, cell = cell_of(spec)
     drawn, process = optimize(spec), process_from_spec(spec.process)
     rate = task.camera.waves_per_metre(task.camera.lines[0].wavelength_m)
-    drawn_light = np.abs(task.problem.amplitudes(cell)) ** 2
+    drawn_light = np.abs(own.amplitudes(cell)) ** 2
     for errors in plates_of(process, 4, 7):
         alone = Variation(
             common_depth_scale=errors.common_depth_scale, depth_scale=errors.depth_scale,
             overlay_x_m=errors.overlay_x_m, cd_bias_m=errors.cd_bias_m, sidewall_rad=errors.sidewall_rad,
         )  # fmt: skip
-        made = SpotPlates.of(task.problem, process, rate, [alone])
+        made = SpotPlates.of(own, process, rate, [alone])
         light = np.abs(made.amplitudes(cell)[:, 0]) ** 2
-        table = orders_of_design(drawn, drawn.fabricated(variation=alone))
+        (table,) = orders_of_design(drawn, drawn.fabricated(variation=alone))
         # Light of strips lies up to 0.1 radian beside walls at the fourth order of 96 cells: found 1.6 % of a spot.
         assert table.efficiency == pytest.approx(light, abs=0.02 * light.mean())
         assert np.abs(table.efficiency - drawn_light).max() > 0.05 * light.mean()

@@ -200,10 +200,10 @@ def test_the_merit_of_an_exchange_is_that_of_its_formula():
     power = np.abs(light) ** 2
     uneven = 1.4 * np.mean((power / shares / np.mean(power / shares) - 1) ** 4) ** 0.25
     none, wave = np.zeros(0, complex), np.sqrt(shares) * np.exp(1j * rng.uniform(0, 6, 4))
-    assert _merit(light, shares, none, 0.6) == pytest.approx(power.sum() - 0.6 * uneven, rel=1e-12)
+    assert _merit(light, shares, 1, none, 0.6) == pytest.approx(power.sum() - 0.6 * uneven, rel=1e-12)
     in_wave = abs(np.vdot(wave, light)) ** 2
-    assert _merit(light, shares, wave.conj(), 0.6) == pytest.approx(in_wave - 0.6 * uneven, rel=1e-12)
-    assert np.isfinite(_merit(0 * light, shares, none, 0.6))
+    assert _merit(light, shares, 1, wave.conj(), 0.6) == pytest.approx(in_wave - 0.6 * uneven, rel=1e-12)
+    assert np.isfinite(_merit(0 * light, shares, 1, none, 0.6))
 
 
 def test_an_exchange_without_heat_takes_what_is_better_and_nothing_else():
@@ -212,7 +212,7 @@ def test_an_exchange_without_heat_takes_what_is_better_and_nothing_else():
     merits, none = [], np.zeros(0, complex)
     for sweeps in range(6):
         level = exchange(task, begun, sweeps=sweeps, seed=1, uniformity=0.5, heat=0.0)
-        merits.append(_merit(task.amplitudes(level).astype(complex), task.spots.shares, none, 0.5))
+        merits.append(_merit(task.amplitudes(level).astype(complex), task.spots.shares, 1, none, 0.5))
     assert (np.diff(merits) > -1e-6).all()  # single precision
     assert merits[1] > merits[0] + 0.1
     assert merits[-1] > merits[1]
