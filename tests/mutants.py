@@ -44,6 +44,9 @@ EVERYTHING = (
     "sim/**/*.py",
     "fab/**/*.py",
     "doedesign/design/*.py",
+    "doedesign/spots/*.py",
+    "doedesign/areas/*.py",
+    "doedesign/focus/*.py",
     "doedesign/calibration/*.py",
     "doedesign/tolerancing/*.py",
 )
