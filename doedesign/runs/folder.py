@@ -195,7 +195,7 @@ def claim_run(
             results changed since; or another process works in it.
     """
     _require_no_file(folder)
-    with alone_in(folder), restored_unless_replaced(folder):
+    with _none_left_empty(folder), alone_in(folder), restored_unless_replaced(folder):
         known = _is_known(folder)
         if known and overwrite and not _belongs(_read_manifest(folder), spec, inputs):
             set_aside(folder)
@@ -204,6 +204,19 @@ def claim_run(
         if run.done:  # perhaps stopped before the last line of `finish_run`
             run.path(CHECKPOINT).unlink(missing_ok=True)
         yield run
+
+
+@contextlib.contextmanager
+def _none_left_empty(folder: Path) -> Iterator[None]:
+    """Remove a folder that the block made if it fails before it has written anything."""
+    made = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        if made:
+            with contextlib.suppress(OSError):  # such as one that is not empty
+                folder.rmdir()
+        raise
 
 
 def require_room(folder: Path) -> None:
