@@ -82,16 +82,16 @@ def test_a_run_is_begun_resumed_and_finished(spec: Spec, tmp_path: Path):
 
 def test_a_refused_run_leaves_no_empty_folder(spec: Spec, tmp_path: Path):
     def refused(folder: Path, *, begins: bool = False) -> None:
-        with pytest.raises(InputError), claim_run(folder, spec, {}) as claimed:
+        with claim_run(folder, spec, {}) as claimed:
             if begins:
                 begin_run(claimed)
             raise InputError("spots", "must be", "none", "Add some.")
 
-    refused(tmp_path / "new")
-    assert not (tmp_path / "new").exists()
     (tmp_path / "own").mkdir()
-    refused(tmp_path / "own")
-    refused(tmp_path / "begun", begins=True)
+    for name, begins in (("new", False), ("own", False), ("begun", True)):
+        with pytest.raises(InputError):
+            refused(tmp_path / name, begins=begins)
+    assert not (tmp_path / "new").exists()
     assert (tmp_path / "own").is_dir()
     assert (tmp_path / "begun" / "manifest.json").is_file()
 
