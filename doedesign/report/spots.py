@@ -45,7 +45,7 @@ def _title(table: "OrderTable") -> str:
 
 
 def _note(*tables: "OrderTable") -> str:
-    """What the shares are of, and the ceiling."""
+    """The note under a picture: of which light the shares are, and the ceiling."""
     bound = tables[0].ceiling
     ceiling = "No ceiling is known."
     if bound.efficiency is not None:

@@ -2,6 +2,7 @@
 
 spots          where spots lie and how much light each should have
 superposition  weighted Gerchberg-Saxton, levels in the loop
+problem        a DOE to be designed: from plane waves to levels, and on to light, in one colour or several
 shared_levels  the level of a cell that suits several colours
 search         phases of the spots, by many starts at once
 exchange       single cells of a small unit cell, changed one by one

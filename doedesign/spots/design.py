@@ -16,9 +16,10 @@ from doedesign.spec.targets.spots import MOST_CELLS, SpotsSpec, places_of
 from doedesign.spots.exchange import exchange
 from doedesign.spots.orders import OrderTable, order_table
 from doedesign.spots.plates import SpotPlates, plates_of
+from doedesign.spots.problem import SharedProblem, SpotProblem
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, shares_of
-from doedesign.spots.superposition import SharedProblem, SpotLight, SpotProblem, Staircase, WaveSet
+from doedesign.spots.superposition import SpotLight, Staircase, WaveSet
 from fab.draws import varying
 from fab.errors import InputError
 from fab.grid import Grid

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from doedesign.spots.superposition import SharedProblem, SpotProblem
+from doedesign.spots.problem import SharedProblem, SpotProblem
 
 FLAT = 1.4  # (max - min) / (max + min) over that root, about
 _ANY, _ANY_OF_TWO = 0.5, 0.1  # share of offers of another level than a neighbour's

@@ -20,7 +20,7 @@ from jaxtyping import Complex, Float, Int, UInt8
 
 from doedesign.spots.exchange import cooled, offers
 from doedesign.spots.plate_sums import amplitudes_of, merit_of, sweep
-from doedesign.spots.superposition import SpotProblem
+from doedesign.spots.problem import SpotProblem
 from fab.draws import draw_at, varying
 from fab.process import Process, Variation
 from sim.surface.relief import effective_bias, relief_of

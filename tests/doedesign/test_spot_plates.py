@@ -12,8 +12,9 @@ from doedesign.spec.targets.arrangements import grid_orders
 from doedesign.spots import design, plate_sums
 from doedesign.spots.design import SpotTask, orders_of_design
 from doedesign.spots.plates import SpotPlates, plates_of
+from doedesign.spots.problem import SpotProblem
 from doedesign.spots.spots import Spots, shares_of
-from doedesign.spots.superposition import SpotProblem, Staircase
+from doedesign.spots.superposition import Staircase
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels

@@ -12,9 +12,10 @@ from doedesign.spec.targets.spots import open_periods
 from doedesign.spots import search
 from doedesign.spots.exchange import _merit, cooled, exchange, offered, offers
 from doedesign.spots.orders import ceiling_of, order_table
+from doedesign.spots.problem import SpotProblem
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, shares_of
-from doedesign.spots.superposition import SpotProblem, Staircase, WaveSet, spot_light
+from doedesign.spots.superposition import Staircase, WaveSet, spot_light
 from fab.aperture import MaskAperture, RectangularAperture
 from fab.grid import Grid
 from sim.camera import Camera, Colour

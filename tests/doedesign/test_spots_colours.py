@@ -15,9 +15,10 @@ from doedesign.spec import Spec, load_spec, spec_to_toml
 from doedesign.spots.design import SpotTask
 from doedesign.spots.exchange import exchange
 from doedesign.spots.orders import OrderTables
+from doedesign.spots.problem import SharedProblem, SpotProblem
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots
-from doedesign.spots.superposition import SharedProblem, SpotProblem, Staircase, WaveSet, shared_level
+from doedesign.spots.superposition import Staircase, WaveSet, shared_level
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.process import Variation
