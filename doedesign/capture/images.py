@@ -202,6 +202,9 @@ def display_values(picture: np.ndarray) -> Picture:
     Raises:
         InputError: another shape or another type, or values beyond 0 to 1.
     """
+    if not isinstance(picture, np.ndarray):
+        got = f"a {type(picture).__name__}"
+        raise InputError("picture", "must be a file, or an array [y, x, 3]", got, "Give np.asarray of it.")
     if picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
         raise InputError("picture", "must be an array [y, x, 3]", f"shape {picture.shape}", "Give red, green and blue.")
     if picture.dtype == np.uint8:

@@ -20,6 +20,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,9 +38,9 @@ def require_seed(seed: int) -> None:
         seed: the seed.
 
     Raises:
-        InputError: it is negative, or beyond 32 bits.
+        InputError: it is no whole number, negative, or beyond 32 bits.
     """
-    if not 0 <= seed < 1 << 32:
+    if not isinstance(seed, Integral) or not 0 <= seed < 1 << 32:
         raise InputError("seed", "must be from 0 to 4294967295", seed, "For example 0.")
 
 

@@ -6,6 +6,7 @@ PSFs are computed at the very depths of the scene; nothing is interpolated betwe
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,8 +23,9 @@ from doedesign.capture.from_spec import (
     sensor_side,
 )
 from doedesign.capture.images import display_values
-from doedesign.capture.scenes import NamedScene, draw_scene
+from doedesign.capture.scenes import NamedScene, draw_scene, require_seed
 from doedesign.design.design import Design
+from doedesign.runs.level_maps import open_design
 from doedesign.spec import Spec
 from fab.errors import InputError
 from fab.figure import bare, html_of, length_text, panels
@@ -42,6 +44,8 @@ from sim.surface import FabricatedDoe
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
+
+    from doedesign.runs.folder import Run
 
 Psfs = Callable[[float], Float[np.ndarray, "c y x"]]
 
@@ -119,7 +123,7 @@ class SimulatedCapture:
 
 def simulate(
     picture: str | Path | np.ndarray,
-    design: Design,
+    design: "Design | Run | str | Path",
     *,
     obstruction: str | ObstructionKind | None = None,
     occlusion: str | None = None,
@@ -132,7 +136,8 @@ def simulate(
     Args:
         picture: a file, or display values (sRGB) `[y, x, 3]`, uint8 or floats from 0 to 1, row 0 at the lowest y. A
             crop of it fills the frame; a smaller picture is enlarged.
-        design: the DOE and its camera. Its spec says what is left out here, and what the sensor does.
+        design: the DOE and its camera, or a finished run or its folder. Its spec says what is left out here, and what
+            the sensor does.
         obstruction: a kind such as "dirt", "raindrop" or "fence", a folder of masks, or a kind with parameters of its
             own (`sim.obstruction`). A kind by its name has the spec's options where it is the spec's.
         occlusion: how an obstruction takes light from what lies behind it: "reciprocal", "radiometric", "paper" or
@@ -144,6 +149,8 @@ def simulate(
     Raises:
         InputError: no occlusion model or obstruction is named, or a picture, name or number cannot be used.
     """
+    design = open_design(design)
+    require_seed(seed)
     stage = Stage.of(design, obstruction, occlusion, size)
     if isinstance(picture, str | Path):
         shown, name = read_display(picture, 2 * max(stage.view.shape)), Path(picture).name
@@ -187,7 +194,7 @@ class Stage(NamedTuple):
 def _side(spec: Spec | None, size: int | None) -> int:
     most = _MOST_SIDE if spec is None else sensor_side(spec)
     side = min(_USUAL_SIDE, most) if size is None else size
-    if not 16 <= side <= most:
+    if not isinstance(side, Integral) or not 16 <= side <= most:
         rule = f"must lie from 16 to the {most} binned pixels of the sensor's shorter side"
         raise InputError("size", rule, side, "Choose another size.")
     return side

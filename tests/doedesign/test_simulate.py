@@ -94,6 +94,7 @@ def test_in_memory_and_in_files_the_same(run: Path, design: Design, picture: Pat
         np.testing.assert_array_equal(read_image(run / "simulated" / found.items[0], images[name]), image)
     for values in (read_display(picture), read_display(picture) / 255):
         np.testing.assert_array_equal(simulate(values, design, **ASKED, seed=3).doe, shot.doe)
+    np.testing.assert_array_equal(simulate(picture, run, **ASKED, seed=3).doe, shot.doe)
     assert not np.array_equal(simulate(picture, design, **ASKED, seed=4).doe, shot.doe)
 
 
@@ -148,3 +149,20 @@ def test_without_a_spec_everything_is_named(design: Design, picture: Path):
 def test_what_is_no_picture(design: Design, values: Any, words: str):
     with pytest.raises(InputError, match=words):
         simulate(values, design, **ASKED)
+
+
+@pytest.mark.usefixtures("annotations_unchecked")
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"picture": [[[0, 0, 0]]]}, r"picture: must be a file, or an array \[y, x, 3\], but got a list"),
+        ({"seed": -1}, "seed: must be from 0 to 4294967295"),
+        ({"seed": 1.5}, "seed: must be from 0 to 4294967295"),
+        ({"size": "64"}, "size: must lie from 16"),
+        ({"size": 64.5}, "size: must lie from 16"),
+    ],
+)
+def test_what_is_no_number_of_a_capture(design: Design, picture: Path, changes: dict[str, Any], words: str):
+    asked: dict[str, Any] = {"picture": picture, "design": design, **ASKED, **changes}
+    with pytest.raises(InputError, match=words):
+        simulate(**asked)
