@@ -6,7 +6,6 @@ key is the one there, and says of a mean which ("near", "far" or none for all).
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -94,10 +93,6 @@ def main_numbers(folder: Path, record: Record) -> tuple[MainNumber, ...]:
 def _mean(rows: Iterable[Mapping[str, Any]], value: Callable[[Mapping[str, Any]], Any]) -> float | None:
     found = [float(one) for row in rows if (one := value(row)) is not None]
     return sum(found) / len(found) if found else None
-
-
-def _get(name: str, row: Mapping[str, Any]) -> Any:
-    return row.get(name)
 
 
 def _percent(share: Any) -> float | None:
@@ -209,11 +204,13 @@ def _of_plates(means: Mapping[str, float | None], words: str = "") -> Iterator[M
 def _of_plate(folder: Path, _: Mapping[str, Any]) -> Iterator[MainNumber]:
     metrics = read_json(folder / METRICS_FILE)
     rows = metrics["fabricated"]
-    yield from _of_plates({name: _mean(rows, partial(_get, name)) for name, *_ in _ON_PLATES})
-    order = _percent(_mean(rows, lambda row: row["zeroth_order"]))
-    yield MainNumber("zeroth_order", "0th order", order, "%", note=zeroth_note(metrics))
-    inside = _percent(_mean(rows, lambda row: row["throughput"]))
-    yield MainNumber("throughput", "light in the window", inside, "%", "high")
+
+    def mean(name: str) -> float | None:
+        return _mean(rows, lambda row: row.get(name))
+
+    yield from _of_plates({name: mean(name) for name, *_ in _ON_PLATES})
+    yield MainNumber("zeroth_order", "0th order", _percent(mean("zeroth_order")), "%", note=zeroth_note(metrics))
+    yield MainNumber("throughput", "light in the window", _percent(mean("throughput")), "%", "high")
 
 
 def tolerance_record(folder: Path) -> dict[str, Any]:

@@ -270,7 +270,7 @@ class SpotTask:
         return max(refined, key=lambda level: problem.light(level).merit(uniformity))
 
     def _refined(
-        self, level: UInt8[np.ndarray, "y x"], finer: "list[SpotProblem | SharedProblem]"
+        self, level: UInt8[np.ndarray, "y x"], finer: list[SpotProblem | SharedProblem]
     ) -> UInt8[np.ndarray, "y x"]:
         """A row in narrower and narrower cells."""
         seed, uniformity = self.spec.optimize.seed, self.table.uniformity

@@ -118,6 +118,7 @@ class SharedProblem(_Designed):
     def level(self, waves: WaveSet) -> UInt8[np.ndarray, "y x"]:
         """Level map of the sums of plane waves of all colours."""
         amplitudes = waves.amplitudes
+        # A cell counts for a colour by its light of that colour.
         fields = [
             one.sums.superposition(amplitudes[own]) * (one.coverage / one.coverage.mean())
             for one, own in zip(self.parts, self.spots.of_colours, strict=True)
