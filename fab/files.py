@@ -119,14 +119,18 @@ def _locked(make: Callable[[], tuple[Path, int]]) -> tuple[Path, int]:
         os.close(handle)  # cleared by another process before it was locked
 
 
-def lock(handle: int) -> bool | None:
+def lock(handle: int, *, shared: bool = False) -> bool | None:
     """Lock an open file or folder until its handle is closed, without waiting.
+
+    Args:
+        handle: descriptor of the open file or folder.
+        shared: beside others that ask for the same, which only look whether one works there.
 
     Returns:
         whether it could be had; None where the file system has no locks.
     """
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:

@@ -28,7 +28,7 @@ def report(
     Args:
         run: Run folder, finished or at work.
         compare: Other runs to put beside it, with their differences.
-        watch: Write it again whenever the run has changed, until nothing in it is at work; stop with Ctrl-C.
+        watch: Write it again whenever the run has changed, until it is done or stopped; end with Ctrl-C.
         order: The run's mask order; masks/NAME by default.
         out: The file; RUN/report.html by default, RUN/comparison.html beside others.
     """
@@ -45,6 +45,7 @@ def report(
     try:
         for written in watch_report(run, order=order, out=out):
             say(f"written {written}; reload it in the browser")
+        say("nothing works in this run any more")
     except KeyboardInterrupt:
         say("stopped watching")
     if written is not None:

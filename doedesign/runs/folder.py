@@ -24,6 +24,7 @@ import contextlib
 import json
 import os
 import re
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -153,6 +154,15 @@ def input_digests(files: Mapping[str, Path]) -> dict[str, str]:
     return {key: sha256_file(path) for key, path in files.items()}
 
 
+def _is_alone(handle: int) -> bool:
+    """Lock a folder, unless another process works there; one that only looks whether it is so is gone at once."""
+    for pause_s in (0.05, 0.2, 0.0):
+        if lock(handle) is not False:
+            return True
+        time.sleep(pause_s)
+    return False
+
+
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """Keep other processes out of a run folder (made if missing), and remove the temporary files of a killed one.
@@ -165,11 +175,27 @@ def alone_in(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise explain_os_error(error, folder) from error
     try:
-        if lock(handle) is False:
+        if not _is_alone(handle):
             rule = "only one process may work in a run folder"
             raise InputError(str(folder), rule, "a second one", "Wait for the first.")
         clear_killed(folder, _WRITTEN.fullmatch)
         yield
+    finally:
+        os.close(handle)
+
+
+def is_worked_in(folder: Path) -> bool:
+    """Whether a process is at work in a run folder; also where the file system has no locks and cannot tell.
+
+    Args:
+        folder: the run folder.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        return lock(handle, shared=True) is not True
     finally:
         os.close(handle)
 

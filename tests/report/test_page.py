@@ -35,7 +35,7 @@ from doedesign.report.page.maps import height_block
 from doedesign.report.page.numbers import LABELS, SHARES
 from doedesign.report.page.reached import asked_block, reached_section
 from doedesign.report.page.write import watch_report
-from doedesign.runs.folder import LEVEL_MAP, load_checkpoint, open_run
+from doedesign.runs.folder import LEVEL_MAP, alone_in, load_checkpoint, open_run
 from doedesign.runs.results import results_folder
 from doedesign.spec.models import ObjectiveSpec
 from fab.errors import InputError
@@ -486,7 +486,7 @@ def test_no_run_no_page(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_run_at_work_shows_its_loss(run: Path, tmp_path: Path):
-    """Up to its last checkpoint; then, once it is done, all of it."""
+    """Up to its last checkpoint, also where it was stopped; then, once it is done, all of it."""
     spec = tmp_path / "steps.toml"
     spec.write_text(SPREAD.replace("steps = 0", "steps = 3\ncheckpoint_every = 1"))
     folder = tmp_path / "runs" / "steps"
@@ -502,7 +502,13 @@ def test_a_run_at_work_shows_its_loss(run: Path, tmp_path: Path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("doedesign.optimization.save_checkpoint", lambda *given: (before(*given), stop()))
         assert call("optimize", spec, "--out", folder)[0] == 130
-    content = gather(folder)
+    assert "stopped" in gather(folder).summary[0]
+    # Nothing works there, so there is nothing to wait for.
+    assert [b"stopped" in path.read_bytes() for path in watch_report(folder, out=tmp_path / "live.html")] == [True]
+    with alone_in(folder):
+        content = gather(folder)
+        pages = watch_report(folder, out=tmp_path / "live.html", every_s=0.01)
+        first = next(pages).read_bytes()
     assert names(content)[0] == "history"
     assert "at work" in content.summary[0]
     assert len(blocks(content, ChartBlock)[0].x) >= 2
@@ -510,8 +516,6 @@ def test_a_run_at_work_shows_its_loss(run: Path, tmp_path: Path):
     assert blocks(content, ChartBlock)[0].note == ""
     terms = next(block for block in blocks(content, TableBlock) if block.title == "Objectives")
     assert terms.note == "Values without weights."
-    pages = watch_report(folder, out=tmp_path / "live.html", every_s=0.01)
-    first = next(pages).read_bytes()
     assert b"at work" in first
     assert call("optimize", spec, "--out", folder)[0] == 0
     assert [path.read_bytes() != first for path in pages] == [True]  # once more, and it ends with the run

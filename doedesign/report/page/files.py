@@ -15,7 +15,7 @@ import numpy as np
 
 from doedesign.overview.kinds import has_record, record_of
 from doedesign.report.page.blocks import PageImage
-from doedesign.runs.folder import CHECKPOINT, FORMAT, LEVEL_MAP, Run, open_run
+from doedesign.runs.folder import CHECKPOINT, FORMAT, LEVEL_MAP, Run, is_worked_in, open_run
 from doedesign.runs.orders import order_of_run
 from doedesign.spec import Spec, load_spec
 from doedesign.training.history import HISTORY_NAME, read_history
@@ -210,7 +210,7 @@ def work_state(folder: Path) -> tuple[bool, tuple[tuple[str, int, int], ...]]:
         folder: the run folder.
     """
     homes = [folder, *(folder / name for name in ("trained", "finetuned"))]
-    states = [read_json(home / MANIFEST_NAME).get("state") for home in homes if (home / MANIFEST_NAME).is_file()]
+    working = [home for home in homes if (home / MANIFEST_NAME).is_file() and _is_at_work(home)]
     watched = sorted([*folder.glob(f"*/{MANIFEST_NAME}"), *folder.glob(f"*/{HISTORY_NAME}"), folder / MANIFEST_NAME,
                       folder / CHECKPOINT])  # fmt: skip
     facts = []
@@ -218,7 +218,13 @@ def work_state(folder: Path) -> tuple[bool, tuple[tuple[str, int, int], ...]]:
         with contextlib.suppress(FileNotFoundError):  # a checkpoint may go meanwhile
             about = path.stat()
             facts.append((str(path), about.st_mtime_ns, about.st_size))
-    return "running" in states, tuple(facts)
+    return bool(working), (("working", len(working), 0), *facts)
+
+
+def _is_at_work(home: Path) -> bool:
+    """Whether a run or a training is neither finished nor stopped; looked at in this order, so that none ends between."""
+    worked_in = is_worked_in(home)
+    return worked_in and read_json(home / MANIFEST_NAME).get("state") == "running"
 
 
 def training_of(folder: Path) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ from doedesign.report.page.networks import captures_section, evaluation_section,
 from doedesign.report.page.numbers import length
 from doedesign.report.page.provenance import provenance_section
 from doedesign.report.page.reached import reached_section
+from doedesign.runs.folder import is_worked_in
 from fab.figure import aperture_text
 
 
@@ -55,8 +56,10 @@ def gather(folder: Path, order: Path | None = None) -> PageContent:
 
 def _summary(files: RunFiles, steps: int) -> tuple[str, ...]:
     if files.run is None:
-        of = files.spec.all_steps
-        return (f"This run is at work: {steps} of {of} steps at its last checkpoint.",)
+        done = f"{steps} of {files.spec.all_steps} steps at its last checkpoint"
+        if is_worked_in(files.folder):
+            return (f"This run is at work: {done}.",)
+        return (f"This run was stopped: {done}. The same `doedesign optimize` as before goes on from there.",)
     return ()
 
 

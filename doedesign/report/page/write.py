@@ -73,7 +73,7 @@ def _is_page(path: Path) -> bool:
 def watch_report(
     run: str | Path, *, order: str | Path | None = None, out: str | Path | None = None, every_s: float = _EVERY_S
 ) -> Iterator[Path]:
-    """Write the page of a run whenever its files changed, until nothing in it is at work; yield it every time.
+    """Write the page of a run whenever its files changed, until nothing works in it any more; yield it every time.
 
     Args:
         run: the run folder.
