@@ -9,6 +9,7 @@ it sees is the conventional capture, or the sharp scene with a black hole ("scen
 methods, or the capture through the proposed plate ("plate").
 """
 
+import os
 import shlex
 import subprocess
 from collections.abc import Mapping
@@ -19,6 +20,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Bool, Float
 
+from doedesign.runtime.effort import Effort, note_effort
 from fab.errors import InputError
 from fab.pictures import read_display, write_pixels
 
@@ -97,14 +99,22 @@ def run_program(method: ExternalMethod, given: Path, found: Path) -> None:
     places: Mapping[str, str] = {"{in}": str(given.resolve()), "{out}": str(found.resolve())}
     words = [_with(word, places) for word in method.command]
     where, cure = f"method {method.name}", "Try the command by itself on that folder."
+    ended_s = _of_ended_s()
     try:
         done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
     except OSError as error:
         got = f'"{error.strerror or error}"'
         raise InputError(where, f"{words[0]} must be a program that can be run", got, "Correct it.") from error
+    note_effort(Effort(_of_ended_s() - ended_s, 0))
     if done.returncode:
         said = (done.stderr or done.stdout).strip()[-_WORDS_SHOWN:]
         raise InputError(where, "must end without an error", f"exit code {done.returncode}: {said}", cure)
+
+
+def _of_ended_s() -> float:
+    """Processor time of the processes that this one started and that have ended."""
+    now = os.times()
+    return now.children_user + now.children_system
 
 
 def _with(word: str, places: Mapping[str, str]) -> str:

@@ -10,8 +10,6 @@ its work done, neither.
 import json
 import os
 import platform
-import resource
-import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -21,13 +19,13 @@ from typing import Any, NamedTuple
 
 from doedesign import __version__
 from doedesign.runs.folder import COST_NAME, FORMAT
+from doedesign.runtime.effort import efforts
 from doedesign.runtime.memory import peak_bytes
 from doedesign.runtime.progress import duration_text
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, read_json
 from sim.threads import cores
 
-_KIB = 1 if sys.platform == "darwin" else 1024  # what getrusage counts memory in
 _MIB, _GIB = 1 << 20, 1 << 30
 _MOST = 1e18  # seconds or bytes that a command may have taken; no machine has more
 
@@ -38,7 +36,7 @@ class Cost(NamedTuple):
     Attributes:
         commands: their names.
         seconds: time from start to end.
-        cpu_s: processor time, of worker processes too.
+        cpu_s: processor time, of worker processes and of other programs that were called, too.
         peak_bytes: the most memory that the process held.
         worker_peak_bytes: the most that a single worker process held; 0 without workers.
         host: name of the machine; of several, each once.
@@ -109,7 +107,7 @@ def measured(run: Path | None, command: str, *, writes: Path | None = None) -> I
         an object that has the cost when the block has ended.
     """
     places = [path for path in (run, writes) if path is not None]
-    before, start, cpu = [_changed_ns(path) for path in places], time.monotonic(), _cpu_s()
+    before, start, cpu, known = [_changed_ns(path) for path in places], time.monotonic(), _cpu_s(), len(efforts())
     measuring, ended = Measuring(run), "failed"
     try:
         yield measuring
@@ -118,12 +116,13 @@ def measured(run: Path | None, command: str, *, writes: Path | None = None) -> I
         ended = "stopped"
         raise
     finally:
+        of_others = efforts()[known:]
         measuring.cost = Cost(
             (command,),
             round(time.monotonic() - start, 3),
-            round(_cpu_s() - cpu, 3),
+            round(_cpu_s() - cpu + sum(one.cpu_s for one in of_others), 3),
             peak_bytes(),
-            resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * _KIB,
+            max((one.peak_bytes for one in of_others), default=0),
             platform.node(),
             cores(),
             datetime.now(UTC).isoformat(timespec="seconds"),
@@ -136,9 +135,9 @@ def measured(run: Path | None, command: str, *, writes: Path | None = None) -> I
 
 
 def _cpu_s() -> float:
-    """Processor time of this process and of children that it has waited for."""
+    """Processor time of this process."""
     now = os.times()
-    return now.user + now.system + now.children_user + now.children_system
+    return now.user + now.system
 
 
 def _changed_ns(run: Path) -> tuple[int, ...]:

@@ -18,8 +18,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from functools import cache, partial
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
+from doedesign.runtime.effort import Effort, note_effort
+from doedesign.runtime.memory import peak_bytes
 from fab.errors import InputError
 from sim.threads import cores
 
@@ -128,13 +130,16 @@ def _until_broken(
                 if isinstance(found, _Untold):
                     flying[executor.submit(_evaluate, work.token, work, items[key])] = key
                 else:
-                    yield key, found
+                    note_effort(found.effort)
+                    yield key, found.result
                 del flying[future]
     except TerminatedWorkerError:
         # What was finished just before counts.
         lost = [future for future in flying if not future.done() or future.cancelled() or future.exception()]
         told = {future: future.result() for future in flying if future not in lost}
-        yield from ((flying[future], found) for future, found in told.items() if not isinstance(found, _Untold))
+        for found in [one for one in told.values() if not isinstance(one, _Untold)]:
+            note_effort(found.effort)
+        yield from ((flying[future], found.result) for future, found in told.items() if not isinstance(found, _Untold))
         return [key for future, key in flying.items() if future in lost or isinstance(told[future], _Untold)]
     except BaseException:
         executor.shutdown(kill_workers=True)  # nobody waits for what is under way
@@ -171,8 +176,18 @@ def _worker_settings() -> dict[str, str]:
 _HELD: dict[str, Work] = {}
 
 
+_said_s = 0.0  # processor time of this worker that was told
+
+
 class _Untold:
     """Answer of a worker that has no copy of the evaluation yet."""
+
+
+class _Told(NamedTuple):
+    """Answer of a worker: the result of an item, and what the worker took since its last answer."""
+
+    result: Any
+    effort: Effort
 
 
 def _begin(parent: int, path: tuple[str, ...]) -> None:
@@ -189,11 +204,14 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _evaluate(token: str, work: Work | None, item: Any) -> Any:
+def _evaluate(token: str, work: Work | None, item: Any) -> _Told | _Untold:
+    global _said_s
     # The first copy stands for all that follow it: what it has compiled and computed belongs to it.
     if token not in _HELD:
         if work is None:
             return _Untold()
         _HELD.clear()
         _HELD[token] = work
-    return _HELD[token](item)
+    result = _HELD[token](item)
+    before, _said_s = _said_s, time.process_time()
+    return _Told(result, Effort(_said_s - before, peak_bytes()))

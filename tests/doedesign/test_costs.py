@@ -5,11 +5,13 @@ import math
 import platform
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from doedesign.evaluation.external import ExternalMethod, run_program
 from doedesign.runs.costs import Cost, costs_of, elapsed_text, measured, together
 from doedesign.runs.folder import COST_NAME
 from tests.doedesign.small_runs import SPEC, call, finished_run
@@ -61,6 +63,18 @@ def test_the_memory_of_who_starts_a_command_is_not_its_own():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 0 < int(done.stdout) < 0.9 * held.nbytes
+
+
+def test_the_time_of_other_programs_counts(tmp_path: Path):
+    burning = "import time\nwhile time.process_time() < 0.4: pass"
+    program = ExternalMethod("other", (sys.executable, "-c", burning), "conventional")
+    with measured(None, "evaluate") as taken:
+        begun = time.process_time()
+        run_program(program, tmp_path, tmp_path / "out")
+        own_s = time.process_time() - begun
+    assert taken.cost is not None
+    assert taken.cost.cpu_s > own_s + 0.4 - 0.05  # the clock of processes ticks every 0.01 s
+    assert taken.cost.worker_peak_bytes == 0
 
 
 def test_nothing_is_kept_of_nothing(tmp_path: Path):

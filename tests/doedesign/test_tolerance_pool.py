@@ -19,8 +19,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
+from doedesign.runs.costs import measured
 from doedesign.runtime.pool import default_workers, evaluate_here
 from doedesign.tolerancing import studies as studies_module
 from doedesign.tolerancing.pool import BYTES_PER_CELL, DrawModel
@@ -97,6 +99,19 @@ def test_an_evaluation_is_sent_to_a_worker_once_not_with_every_item(fakes: Modul
     # Whoever is told twice at first, or is busy then, leaves a few more for the other.
     assert work.sent == 1 if workers == 1 else work.sent <= 10
     assert len({process for _, process in found.values()}) <= workers
+
+
+@pytest.mark.slow
+def test_workers_say_what_they_took(fakes: ModuleType):
+    """They live on when the command ends, and what the system says of their memory begins with that of this process."""
+    held = np.ones(300_000_000)
+    with measured(None, "tolerance") as taken:
+        begun = time.process_time()
+        list(evaluate_here(fakes.Busy(), {str(number): 0.5 for number in range(4)}, 2))
+        own_s = time.process_time() - begun
+    assert taken.cost is not None
+    assert taken.cost.cpu_s > own_s + 4 * 0.5 - 0.05  # the clock of processes ticks every 0.01 s
+    assert 1 << 20 < taken.cost.worker_peak_bytes < 0.9 * held.nbytes
 
 
 @pytest.mark.slow

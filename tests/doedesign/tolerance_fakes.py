@@ -129,3 +129,15 @@ def marked_rows(design: Design, process: Process, variation: Variation) -> list[
     """Leaves its process id in a file."""
     _mark(design, "plates")
     return slow_rows(design, process, variation)
+
+
+class Busy:
+    """An evaluation that computes for a while: an item is how many seconds."""
+
+    noun = "item"
+    token = "busy"
+
+    def __call__(self, seconds: float) -> None:
+        begun = time.process_time()
+        while time.process_time() < begun + seconds:
+            pass

@@ -222,7 +222,7 @@ def work_state(folder: Path) -> tuple[bool, tuple[tuple[str, int, int], ...]]:
 
 
 def _is_at_work(home: Path) -> bool:
-    """Whether a run or a training is neither finished nor stopped; looked at in this order, so that none ends between."""
+    """Whether a run or a training is neither done nor stopped; in this order, so that none ends between."""
     worked_in = is_worked_in(home)
     return worked_in and read_json(home / MANIFEST_NAME).get("state") == "running"
 
