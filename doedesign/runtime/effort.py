@@ -1,4 +1,4 @@
-"""What other processes took while they worked for this one.
+"""Time and memory of other processes that worked for this one.
 
 The system tells that of a process only once it has ended, and begins its peak of memory with that of the one that
 started it. Workers outlive the command that they work for, so they say it themselves, with every item that they return.
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class Effort(NamedTuple):
-    """What a process that helps took since it last said so.
+    """Time and memory of a process that helps, since it last said so.
 
     Attributes:
         cpu_s: processor time, seconds.
