@@ -1,5 +1,8 @@
 """Spots of many plates as fabricated at once, and the exchange of cells that keeps them equal on all of these.
 
+A plate counts once in every colour that has spots: orders of a unit cell are the same sums of cells for all colours,
+and what differs is the phase of the levels. Spots of a colour are held against each other, not against other colours.
+
 A process moves the walls of a unit cell and changes the depths of its etches. Both act on the amplitude of a spot by
 sums that a change of one cell alters in a few places: a level has another phase on every plate, and beside a wall lies
 a strip whose light is that of another set of masks. Strips are as wide as the masks' edges lie apart, wherever these
@@ -32,6 +35,8 @@ _ANY = 0.3  # share of offers of another level than a neighbour's
 class SpotPlates:
     """Effect of the errors of some plates on the spots of a unit cell.
 
+    Of several colours, `plate` counts all plates in the light of the first, then all in that of the second, and so on.
+
     Attributes:
         light: `[level, plate]` transmission of a level.
         across_y: `[level, level, plate]` light that a wall adds, over that of a cell as wide as it is long, between a
@@ -40,6 +45,7 @@ class SpotPlates:
         cells: `[y, spot]` and `[x, spot]` factors whose product is the light of a cell in a spot.
         borders: `[y + 1, spot]` and `[x + 1, spot]` factors of the borders before and behind the cells.
         shares: `[spot]` light of every spot over that of all, as it should be.
+        colours: how many colours have these spots.
     """
 
     light: Complex[np.ndarray, "level plate"]
@@ -48,17 +54,22 @@ class SpotPlates:
     cells: tuple[Complex[np.ndarray, "y m"], Complex[np.ndarray, "x m"]]
     borders: tuple[Complex[np.ndarray, "y_1 m"], Complex[np.ndarray, "x_1 m"]]
     shares: Float[np.ndarray, " m"]
+    colours: int = 1
 
     @classmethod
     def of(
-        cls, problem: SpotProblem, process: Process, waves_per_metre: float, variations: Sequence[Variation]
+        cls,
+        problem: SpotProblem,
+        process: Process,
+        waves_per_metre: Sequence[float],
+        variations: Sequence[Variation],
     ) -> "SpotPlates":
         """Plates with these errors of an open unit cell.
 
         Args:
-            problem: spots of the unit cell.
+            problem: spots of the unit cell, orders that are the same for all colours.
             process: the process that makes it.
-            waves_per_metre: phase of a metre of glass, waves.
+            waves_per_metre: phase of a metre of glass in every colour, waves.
             variations: errors of every plate.
         """
         levels, grid, sums = process.levels, problem.grid, problem.sums
@@ -68,16 +79,19 @@ class SpotPlates:
         moved = np.array([np.asarray(one.shift_m, np.float64) for one in reliefs]) / grid.pitch_m  # [plate, mask, 2]
         grown = np.array([np.asarray(effective_bias(one), np.float64) for one in reliefs]) / grid.pitch_m
         etched = np.arange(1 << levels.bits)[:, None] >> np.arange(levels.bits) & 1
-        by_code = np.exp(-2j * np.pi * waves_per_metre * etched @ depths_m.T)
-        across_y, across_x = (wall_light(by_code, codes, moved[:, :, axis], grown) for axis in (0, 1))
+        by_colour = [np.exp(-2j * np.pi * waves * etched @ depths_m.T) for waves in waves_per_metre]
+        across_y, across_x = (
+            np.concatenate([wall_light(one, codes, moved[:, :, axis], grown) for one in by_colour], axis=2)
+            for axis in (0, 1)
+        )
         upper, left = (
             np.exp(-2j * np.pi * np.outer((np.arange(count + 1) - count / 2) * grid.pitch_m, waves))
             for count, waves in zip(grid.shape, sums.waves_per_m.T, strict=True)
         )
         area = float(np.prod(grid.shape))
         rows, columns = (np.ascontiguousarray(one.T, np.complex128) for one in (sums.along_y, sums.along_x))
-        shares = problem.spots.shares
-        return cls(by_code[codes], across_y, across_x, (rows / area, columns), (upper / area, left), shares)
+        light, factors = np.concatenate(by_colour, axis=1)[codes], ((rows / area, columns), (upper / area, left))
+        return cls(light, across_y, across_x, *factors, problem.spots.shares, len(by_colour))
 
     @property
     def tables(self) -> tuple[Any, ...]:
@@ -89,13 +103,13 @@ class SpotPlates:
         return amplitudes_of(level, *self.tables)
 
     def merit(self, level: UInt8[np.ndarray, "y x"], uniformity: float) -> float:
-        """Mean efficiency of the plates less `uniformity` times how unequal their spots are (`merit_of`)."""
+        """Mean efficiency of the plates, in all colours, less `uniformity` times how unequal spots are (`merit_of`)."""
         return float(merit_of(self.amplitudes(level), self.shares, uniformity))
 
     def uniformity_errors(self, level: UInt8[np.ndarray, "y x"]) -> Float[np.ndarray, " plate"]:
-        """(max - min) / (max + min) of the spots of every plate over their shares."""
+        """(max - min) / (max + min) of the spots of every plate over their shares; of several colours the worst."""
         over = np.abs(self.amplitudes(level)) ** 2 / self.shares[:, None]
-        return np.ptp(over, axis=0) / (over.max(axis=0) + over.min(axis=0))
+        return (np.ptp(over, axis=0) / (over.max(axis=0) + over.min(axis=0))).reshape(self.colours, -1).max(axis=0)
 
     def exchanged(
         self, level: UInt8[np.ndarray, "y x"], *, sweeps: int, seed: int, uniformity: float, heat: float

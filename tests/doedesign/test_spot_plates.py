@@ -37,7 +37,7 @@ def problem(shape: tuple[int, int], count: tuple[int, int], levels: Levels) -> S
 
 
 def plates(of: SpotProblem, levels: Levels, *errors: Variation) -> SpotPlates:
-    return SpotPlates.of(of, Process(levels), WAVES_PER_M, errors)
+    return SpotPlates.of(of, Process(levels), [WAVES_PER_M], errors)
 
 
 def test_a_grating_with_wide_openings_too_deep_and_displaced():
@@ -162,7 +162,7 @@ def test_an_exchange_never_loses_and_repeats_itself():
     levels = Levels(8, 144e-9)
     square = problem((12, 12), (3, 3), levels)
     process = Process(levels, spreads={f"overlay_x_m[{mask}]": Normal(0.0, 4e-7) for mask in range(3)})
-    made = SpotPlates.of(square, process, WAVES_PER_M, plates_of(process, 8, 1))
+    made = SpotPlates.of(square, process, [WAVES_PER_M], plates_of(process, 8, 1))
     level = np.random.default_rng(2).integers(0, 8, (12, 12)).astype(np.uint8)
     one, again = (made.exchanged(level, sweeps=20, seed=4, uniformity=0.5, heat=1e-3) for _ in range(2))
     assert np.array_equal(one, again)
@@ -194,7 +194,7 @@ def test_spots_stay_more_equal_on_plates_that_no_step_has_seen(tmp_path: Path, m
         process = process_from_spec(spec.process)
         rate = task.camera.waves_per_metre(task.camera.lines[0].wavelength_m)
         unseen = unseen or plates_of(process, 400, 99)
-        of = SpotPlates.of(own, process, rate, unseen)
+        of = SpotPlates.of(own, process, [rate], unseen)
         light = np.abs(of.amplitudes(cell)) ** 2
         found.append((np.percentile(of.uniformity_errors(cell), 95), light.sum(axis=0).mean()))
     (nominal, light), (kept, kept_light) = found
@@ -215,7 +215,7 @@ def test_it_agrees_with_the_model_of_the_process(tmp_path: Path):
             common_depth_scale=errors.common_depth_scale, depth_scale=errors.depth_scale,
             overlay_x_m=errors.overlay_x_m, cd_bias_m=errors.cd_bias_m, sidewall_rad=errors.sidewall_rad,
         )  # fmt: skip
-        made = SpotPlates.of(own, process, rate, [alone])
+        made = SpotPlates.of(own, process, [rate], [alone])
         light = np.abs(made.amplitudes(cell)[:, 0]) ** 2
         (table,) = orders_of_design(drawn, drawn.fabricated(variation=alone))
         # Light of strips lies up to 0.1 radian beside walls at the fourth order of 96 cells: found 1.6 % of a spot.

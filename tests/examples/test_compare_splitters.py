@@ -14,7 +14,7 @@ import compare_splitters  # pyright: ignore[reportMissingImports]
 from doedesign.spots import design as spots_design
 
 SMALL = ("doe.samples=96", "doe.aperture=0.192 mm", "spots.starts=20")
-SPLITTER = {"1 x 3": ([3, 1], "64 um", 3.0, 1.0)}
+SPLITTER = {"1 x 3": compare_splitters.Task((3, 1), "64 um", 3.0, 1.0)}
 
 
 @pytest.mark.slow

@@ -200,9 +200,6 @@ def _as_fabricated(spec: "Spec") -> Iterator[InputError]:
         return
     if spots.phases_rad:
         yield InputError(key, "phases of spots must be free", "spots.phases", "Leave one of them out.")
-    if len(spots.colours) > 1:
-        rule, got = "plates are looked at in one colour", f"{len(spots.colours)} colours"
-        yield InputError(key, rule, got, "Name one in spots.colours, or leave it out.")
     side = round(spots.period_m / spec.doe.pitch_m)
     cells = side ** sum(count > 1 for count in spots.count)
     if cells > MOST_CELLS:
