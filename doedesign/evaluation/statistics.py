@@ -19,11 +19,14 @@ _SALT = 17
 
 
 class BootstrapInterval(NamedTuple):
-    """A mean, the ends of its 95 % interval, and the numbers of pairs, photographs and seeds behind it."""
+    """A mean, the ends of its 95 % interval, and the numbers of pairs, photographs and seeds behind it.
+
+    One photograph and one seed say nothing about others: then there is no interval.
+    """
 
     mean: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     pairs: int
     pictures: int
     seeds: int
@@ -57,6 +60,9 @@ def bootstrap_mean(
     names, index = np.unique(np.asarray(pictures)[known], return_inverse=True)
     sums = np.stack([np.bincount(index, row, len(names)) for row in values[:, known].astype(np.float64)])
     counts = np.bincount(index, minlength=len(names)).astype(np.float64)
+    mean, about = float(sums.sum() / (len(sums) * counts.sum())), (int(counts.sum()), len(names), len(sums))
+    if sums.size == 1:
+        return BootstrapInterval(mean, None, None, *about)
     rng = np.random.default_rng((seed, _SALT))
 
     def drawn(count: int) -> np.ndarray:
@@ -67,5 +73,4 @@ def bootstrap_mean(
     means = np.einsum("rs,sp,rp->r", of_seeds, sums, of_pictures) / (len(sums) * (of_pictures @ counts))
     tail = (1 - confidence) / 2
     low, high = np.quantile(means, [tail, 1 - tail])
-    mean = float(sums.sum() / (len(sums) * counts.sum()))
-    return BootstrapInterval(mean, float(low), float(high), int(counts.sum()), len(names), len(sums))
+    return BootstrapInterval(mean, float(low), float(high), *about)

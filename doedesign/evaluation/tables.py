@@ -201,6 +201,8 @@ class EvaluationTable:
         values = [value for one in shown if (value := one.scores["occluded"]["psnr"])]
         over = "photographs and seeds" if max((v.seeds for v in values), default=1) > 1 else "photographs, one seed"
         note = f"95 % intervals of the mean over {over}"
+        if values and all(value.low is None for value in values):
+            note = "one photograph and one seed, which have no interval"
         if any(one.paper for one in shown):
             note += "; hollow: the paper's own pictures and scores"
         if self.joined:
@@ -210,7 +212,8 @@ class EvaluationTable:
             for place, one in enumerate(reversed(shown)):
                 value = one.scores["occluded"]["psnr"]
                 assert value is not None
-                axes.plot([value.low, value.high], [place, place], color=SERIES[0], lw=2.4, solid_capstyle="butt")
+                if value.low is not None and value.high is not None:
+                    axes.plot([value.low, value.high], [place, place], color=SERIES[0], lw=2.4, solid_capstyle="butt")
                 axes.plot(value.mean, place, "o", color=SERIES[0], ms=5)
                 if one.paper is not None:
                     axes.plot(one.paper.psnr, place, "o", color=SERIES[1], ms=5, mfc="none")

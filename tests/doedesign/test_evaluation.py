@@ -119,6 +119,15 @@ def test_seeds_are_drawn_again_too(rng: np.random.Generator):
     assert found.mean == pytest.approx(21, abs=0.02)
 
 
+def test_one_photograph_has_no_interval():
+    """However many pairs it has: what another photograph would give is not known."""
+    found = bootstrap_mean(np.array([[20.0, 22.0, 24.0]]), ["a"] * 3)
+    assert found == BootstrapInterval(22.0, None, None, 3, 1, 1)
+    several = bootstrap_mean(np.array([[20.0], [22.0]]), ["a"])
+    assert several is not None
+    assert (several.low, several.high) == (20.0, 22.0)  # the seeds differ
+
+
 def test_a_pair_without_a_score_does_not_count():
     values = np.array([[1.0, np.nan, 3.0]])
     found = bootstrap_mean(values, ["a", "b", "c"])
@@ -496,6 +505,10 @@ def test_a_table_says_which_rows_are_of_a_later_run_and_how_many_seeds_it_has():
     assert "†" not in alone.text() + alone.latex() + caption(alone)
     two = {region: dict.fromkeys(SCORES, interval._replace(seeds=2)) for region in REGIONS}
     assert "photographs and seeds" in caption(replace(alone, rows=(TableRow(first, two, {}),)))
+    one = {region: dict.fromkeys(SCORES, BootstrapInterval(20.0, None, None, 2, 1, 1)) for region in REGIONS}
+    trial = replace(alone, rows=(TableRow(first, one, {}),))
+    assert "no interval" in caption(trial)
+    assert [row["low"] for row in csv.DictReader(io.StringIO(trial.csv()))] == [""] * len(REGIONS) * len(SCORES)
 
 
 def caption(table: EvaluationTable) -> str:

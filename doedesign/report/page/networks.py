@@ -235,6 +235,14 @@ def evaluation_section(files: RunFiles) -> PageSection | None:
     return section("evaluation", "Evaluation", blocks)
 
 
+def _score_text(score: Mapping[str, Any] | None) -> str:
+    """A mean and its interval, where there is one."""
+    if not score:
+        return "–"
+    within = "" if score["low"] is None else f" ({score['low']:.3f} to {score['high']:.3f})"
+    return f"{score['mean']:.3f}{within}"
+
+
 def _table(table: Mapping[str, Any], folder: Path) -> Iterator[PageBlock]:
     """One table of scores, and its pictures."""
     columns = [(region, score) for region in ("occluded", "full") for score in ("psnr", "ssim", "lpips", "closeness")
@@ -245,7 +253,7 @@ def _table(table: Mapping[str, Any], folder: Path) -> Iterator[PageBlock]:
             left.append(f"{row['label']}: {row['why_not']}")
             continue
         cells = [(row["scores"].get(region) or {}).get(score) for region, score in columns]
-        shown = (f"{one['mean']:.3f} ({one['low']:.3f} to {one['high']:.3f})" if one else "–" for one in cells)
+        shown = map(_score_text, cells)
         paper = row["paper"] or {}
         rows.append((row["label"], *shown, number(paper.get("psnr")), number(paper.get("full_psnr"))))
     head = ("row", *(f"{score.upper() if len(score) < 6 else score}, {region}" for region, score in columns),

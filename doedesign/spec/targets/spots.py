@@ -63,7 +63,8 @@ class SpotsSpec(SpecTable, frozen=True):
         uniformity: how much of the efficiency a uniformity error (max - min) / (max + min) is worth; 0 is for light
             alone.
         uniformity_as_fabricated: the same of plates with the errors of the process, for a unit cell: cells are
-            exchanged for spots that stay equal on these (`doedesign.spots.plates`). 0 looks at the plate as drawn.
+            exchanged for spots that stay equal on these, in every colour (`doedesign.spots.plates`). 0 looks at the
+            plate as drawn.
         starts: random starts of the search for the spots' phases, where these are free.
         colours: names of the colour channels that should get these spots, all alike; the first if left out. A relief of
             several waves parts colours better. Orders of a unit cell are the same for all, and so lie wavelength /
