@@ -1,6 +1,6 @@
 """From a spec with spots to a design: search, weighted Gerchberg-Saxton with levels, exchange of cells."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -201,39 +201,33 @@ class SpotTask:
         problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
         if level.size > MOST_CELLS:
             return level
-        shared = isinstance(problem, SharedProblem)
-        heats, most = (_SHARED_HEATS, _SHARED_OFFERS) if shared else (_HEATS, _OFFERS)
-        sweeps = max(_SWEEPS, most // level.size)
-        # Merit counts uniformity as often as its weight says, and so does heat.
-        heats = [heat * (1 + uniformity) for heat in heats]
-        starts = self._best_of_colours(level) if shared else [level]
-        # An exchange has a smooth measure of its own of how equal spots are, so it may spoil the one that is asked for.
-        found = [level]
-        found += [
-            exchange(problem, start, sweeps=sweeps, seed=seed, uniformity=uniformity, heat=heat)
-            for start in starts
-            for heat in heats
-        ]
-        if 1 in level.shape and self.levels.count <= _FEW_LEVELS:
-            found.append(self._row())
-        lights = [problem.light(one).merit(uniformity) for one in found]
-        return found[int(np.argmax(lights))]
 
-    def _best_of_colours(self, level: UInt8[np.ndarray, "y x"]) -> list[UInt8[np.ndarray, "y x"]]:
-        """The most promising level maps for several colours: that one and those of other phases, exchanged for a while.
+        def merit(one: UInt8[np.ndarray, "y x"]) -> float:
+            return problem.light(one).merit(uniformity)
 
-        How much an exchange gains cannot be seen before: of three by three orders from 0.4 to 14 points.
-        """
-        problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
-        starts = [level]
-        for waves in self._found(_SHARED_TRIED, self._staircases):
-            starts.append(problem.level(self._after(SpotState(waves, waves, -np.inf, 0), _TRIAL_STEPS).best))
-        sweeps, found = max(1, _TRIAL_OFFERS // level.size), []
-        with meter("exchanging cells", len(starts)) as progress:
-            for number, start in enumerate(starts):
-                found.append(exchange(problem, start, sweeps=sweeps, seed=seed, uniformity=uniformity, heat=0.0))
-                progress.advance(number + 1)
-        return sorted(found, key=lambda one: -problem.light(one).merit(uniformity))[:_FINISHED]
+        def exchanged(start: UInt8[np.ndarray, "y x"], sweeps: int, heats: Sequence[float]) -> UInt8[np.ndarray, "y x"]:
+            # Merit counts uniformity as often as its weight says, and so does heat. An exchange has a smooth measure of
+            # its own of how equal spots are, so it may spoil the one that is asked for.
+            how: Any = {"sweeps": sweeps, "seed": seed, "uniformity": uniformity}
+            found = [exchange(problem, start, heat=heat * (1 + uniformity), **how) for heat in heats]
+            return max((start, *found), key=merit)
+
+        if isinstance(problem, SharedProblem):
+            # How much an exchange gains cannot be seen before: of three by three orders from 0.4 to 14 points.
+            others = [SpotState(waves, waves, -np.inf, 0) for waves in self._found(_SHARED_TRIED, self._staircases)]
+            starts = [level, *(problem.level(self._after(state, _TRIAL_STEPS).best) for state in others)]
+            few, many = max(1, _TRIAL_OFFERS // level.size), max(_SWEEPS, _SHARED_OFFERS // level.size)
+            found = _best_of(
+                starts,
+                lambda start: exchanged(start, few, (0.0,)),
+                lambda start: exchanged(start, many, _SHARED_HEATS),
+                len(_SHARED_HEATS) * many // few,
+                merit,
+            )
+        else:
+            found = exchanged(level, max(_SWEEPS, _OFFERS // level.size), _HEATS)
+        row = [self._row()] if 1 in level.shape and self.levels.count <= _FEW_LEVELS else []
+        return max((found, *row), key=merit)
 
     def plates(self, count: int) -> SpotPlates:
         """So many plates with the errors of the spec's process, in every colour that has spots."""
@@ -259,17 +253,13 @@ class SpotTask:
             sweeps, heat = max(1, offers // size), _PLATE_HEAT * (1 + uniformity)
             return plates.exchanged(level, sweeps=sweeps, seed=seed, uniformity=uniformity, heat=heat)
 
-        done, found = 0, []
-        share = _LAST_OFFERS // _TRIAL_OFFERS
-        with meter("exchanging cells", 1 + len(starts) + _FINISHED * share) as progress:
-            for start in (level, *starts):
-                found.append(exchanged(start, _TRIAL_OFFERS))
-                progress.advance(done := done + 1)
-            found.sort(key=lambda one: -plates.merit(one, uniformity))
-            for number, one in enumerate(found[:_FINISHED]):
-                found[number] = exchanged(one, _LAST_OFFERS)
-                progress.advance(done := done + share)
-        return max(found, key=lambda one: plates.merit(one, uniformity))
+        return _best_of(
+            (level, *starts),
+            lambda start: exchanged(start, _TRIAL_OFFERS),
+            lambda start: exchanged(start, _LAST_OFFERS),
+            _LAST_OFFERS // _TRIAL_OFFERS,
+            lambda one: plates.merit(one, uniformity),
+        )
 
     def _raised(self, waves: WaveSet) -> list[UInt8[np.ndarray, "y x"]]:
         """Level maps of a sum of plane waves, raised by every number of levels, each colour by its own phase."""
@@ -303,6 +293,34 @@ class SpotTask:
             halves = np.repeat(level, 2, axis=int(np.argmax(level.shape)))
             level = exchange(one, halves, sweeps=_ROW_SWEEPS // 2, seed=seed, uniformity=uniformity, heat=_FINER_HEAT)
         return level
+
+
+def _best_of(
+    starts: Sequence[UInt8[np.ndarray, "y x"]],
+    tried: Callable[[Any], UInt8[np.ndarray, "y x"]],
+    finished: Callable[[Any], UInt8[np.ndarray, "y x"]],
+    longer: int,
+    merit: Callable[[Any], float],
+) -> UInt8[np.ndarray, "y x"]:
+    """The best level map of some starts, of which all are tried and the most promising are finished.
+
+    Args:
+        starts: level maps.
+        tried: exchanges some cells of one.
+        finished: exchanges many.
+        longer: how many times as long that takes.
+        merit: what is to be large.
+    """
+    done, found = 0, []
+    with meter("exchanging cells", len(starts) + _FINISHED * longer) as progress:
+        for start in starts:
+            found.append(tried(start))
+            progress.advance(done := done + 1)
+        found.sort(key=lambda one: -merit(one))
+        for number, one in enumerate(found[:_FINISHED]):
+            found[number] = finished(one)
+            progress.advance(done := done + longer)
+    return max(found, key=merit)
 
 
 def _problem_of(spec: Spec, camera: Camera, levels: Levels, colour: int) -> SpotProblem:
