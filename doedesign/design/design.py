@@ -138,6 +138,9 @@ class Design:
             raise InputError("seed", "a plate has one source of errors", "also `variation`", "Leave one of them out.")
         if isinstance(variation, Variation):
             return variation, "given errors"
+        if variation is not None and not isinstance(variation, str | Path):
+            rule, cure = "must be a fab.Variation or a TOML file", "For example fab.Variation(common_depth_scale=0.02)."
+            raise InputError("variation", rule, repr(variation), cure)
         if variation is not None:
             return load_variation(variation), f"errors of {Path(variation).name}"
         if not sources_of(process) and not any(spread.mean for spread in process.spreads.values()):
