@@ -81,6 +81,15 @@ def _require_length(name: str, value: Any, *, signed: bool = False, infinite: bo
     raise InputError(name, rule, repr(value), "For example 5e-3 for 5 mm.")
 
 
+def require_same_grid(camera: "Camera", grid: Grid) -> None:
+    """Raise an InputError unless the DOE of a camera lies on this grid, that of a plate."""
+    if camera.grid != grid:
+        shown, own = (
+            f"{one.shape[0]} x {one.shape[1]} cells of {format_length(one.pitch_m)}" for one in (grid, camera.grid)
+        )
+        raise InputError("camera", f"must have the grid of the plate, {shown}", own, "Make it with the plate's grid.")
+
+
 class SpectralLine(NamedTuple):
     """One wavelength of a colour channel.
 

@@ -256,7 +256,8 @@ def optic_of(optic: Any, camera: Camera | None = None, depths_m: Sequence[float]
             raise TypeError(f"`camera` must be left out for a {type(found).__name__}, which has its own")
         return found.with_camera(camera).prepared_for(depths_m)
     if camera is None:
-        raise ValueError(f"a height map needs a `camera`, but got {type(optic).__name__} alone")
+        rule, cure = "a height map needs a `camera`", "Give lens, sensor and substrate, a sim.Camera."
+        raise InputError("camera", rule, f"{type(optic).__name__} alone", cure)
     return optic_as_drawn(camera, optic, depths_m=depths_m)
 
 
@@ -310,7 +311,7 @@ def psf(
 
     Args:
         optic: an `Optic`, anything that carries one (a design, a DOE as fabricated, a bank), or a height map `[y, x]`
-            in metres on `camera.grid`.
+            in metres on `camera.grid`, also as a `fab.HeightMap` or a `fab.LevelMap`; None for the bare lens.
         camera: lens, sensor, substrate and DOE grid of a bare height map; another lens or sensor for an optic of cells.
         depths: one source depth or several, in metres or with a unit; "inf" for a star.
         field_rad: field angles (y, x), radians, positive where light travels toward +y or +x; the window follows the

@@ -1,5 +1,7 @@
 """A plate of one's own, from an array of heights and without a spec: what takes it, and what is said of slips."""
 
+import json
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -65,3 +67,61 @@ def test_a_level_map_is_fabricated_as_its_numbers_are():
     assert hash(errors) == hash(fab.Variation(overlay_x_m=(0.2e-6, 0.0), cd_bias_m=(1e-7, 0.0)))
     made, same = (sim.as_fabricated(one, CAMERA, fab.Process(LEVELS), errors) for one in (PLATE, PLATE.level))
     np.testing.assert_array_equal(made.transmission, same.transmission)
+
+
+def test_maps_serve_as_heights_do():
+    drawn = sim.psf(PLATE.height_m, CAMERA)
+    for plate in (PLATE, dd.Design(PLATE, CAMERA)):
+        found = sim.psf(plate, CAMERA, depths="inf")
+        np.testing.assert_array_equal(found.energy, drawn.energy)
+    np.testing.assert_array_equal(sim.psf(HEIGHT, CAMERA).energy, sim.psf(HEIGHT.height_m, CAMERA).energy)
+    np.testing.assert_array_equal(sim.mtf(PLATE, CAMERA).transfer, sim.mtf(PLATE.height_m, CAMERA).transfer)
+    design = dd.Design(PLATE, CAMERA)
+    assert (design.near_m, design.far_m) == ((), (np.inf,))
+    assert sim.zeroth_order(design) == sim.zeroth_order(sim.HeightOptic.of(CAMERA, PLATE))
+    made = design.fabricated(variation=fab.Variation(common_depth_scale=0.1))
+    assert 0.9 < sim.strehl(made, design)[0] < 0.99
+
+
+OTHER = fab.Grid((SIDE, SIDE), 3e-6)
+
+
+@pytest.mark.usefixtures("annotations_unchecked")
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: sim.psf(PLATE), r"camera: a height map needs a `camera`, but got LevelMap alone\. Give lens, sensor"),
+        (
+            lambda: sim.psf(fab.HeightMap(HEIGHT.height_m, OTHER, 60e-6), CAMERA),
+            "camera: must have the grid of the plate, 32 x 32 cells of 3 um, but got 32 x 32 cells of 2 um",
+        ),
+        (
+            lambda: dd.Design(PLATE, CAMERA, (), np.inf),
+            "far_m: must be several distances, positive metres, but got inf",
+        ),
+        (lambda: dd.Design(PLATE, CAMERA, ("5 cm",)), r"near_m: must be several distances.*For example \(0\.05,\)"),
+        (lambda: dd.Design(HEIGHT, CAMERA), r"level_map: must be a LevelMap, but got a HeightMap\. Quantise heights"),
+        (lambda: dd.Design(PLATE, None), "camera: must be a Camera, but got a NoneType"),
+        (
+            lambda: dd.tolerance(PLATE),
+            r"design: must be a design, a run or its folder, but got a LevelMap\. .*dd\.Design",
+        ),
+        (lambda: dd.write_masks(PLATE), r"source: must be a design, a run or its folder, but got a LevelMap\."),
+        (lambda: dd.write_masks(HEIGHT.height_m), "source: must be a design, a run or its folder, but got a ndarray"),
+        (lambda: sim.zeroth_order(PLATE), r"doe: must be a DOE of cells, but got a LevelMap\. Give a design"),
+        (lambda: sim.strehl(sim.HeightOptic.of(CAMERA), None), "nominal: must be a DOE of cells, but got a NoneType"),
+    ],
+)
+def test_slips_with_a_plate_of_ones_own_are_told(call, told):
+    with pytest.raises(InputError, match=told):
+        call()
+
+
+def test_the_run_sheet_of_ones_own_plate_says_what_it_is_made_of_and_what_light_does(tmp_path):
+    """It had the recipe of fused silica whatever the plate is made of, and nothing of its light."""
+    camera = replace(CAMERA, material="pmma")
+    order = dd.write_masks(dd.Design(PLATE, camera), tmp_path / "order")
+    assert order.order.material == "PMMA"
+    sheet = json.loads(next((tmp_path / "order").glob("*RUNSHEET.json")).read_text())
+    assert sheet["predicted"]["as_drawn"][0]["colour"] == "green"
+    assert sheet["predicted"]["design_wavelength_nm"] == 550
