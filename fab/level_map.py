@@ -165,6 +165,7 @@ def level_digest(level: NDArray[np.uint8]) -> str:
 
 def write_level_map(path: str | Path, level_map: LevelMap) -> None:
     """Write a level map without loss to `path`; the same `level_map` gives the same bytes. Lengths in it are metres."""
+    require_kind("level_map", level_map, LevelMap, "A design has one: design.level_map.")
     levels, grid = level_map.levels, level_map.grid
     header = {
         "format": FORMAT,

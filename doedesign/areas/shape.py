@@ -301,7 +301,8 @@ def targets_of_design(design: Design) -> tuple[AreaTarget, ...]:
         key = spec.area_key(index)
         picture = input_files(spec, f"{key}.picture")[f"{key}.picture"] if area.picture else None
         phase = input_files(spec, f"{key}.phase")[f"{key}.phase"] if area.phase_picture else None
-        targets.append(AreaTarget.of(area, camera_for(area, design.camera), picture, phase, samples=_SAMPLES))
+        camera = camera_for(area, design.camera)
+        targets.append(AreaTarget.of(area, camera, picture, phase, samples=_SAMPLES, key=key))
     return tuple(targets)
 
 

@@ -125,3 +125,35 @@ def test_the_run_sheet_of_ones_own_plate_says_what_it_is_made_of_and_what_light_
     sheet = json.loads(next((tmp_path / "order").glob("*RUNSHEET.json")).read_text())
     assert sheet["predicted"]["as_drawn"][0]["colour"] == "green"
     assert sheet["predicted"]["design_wavelength_nm"] == 550
+
+
+@pytest.mark.usefixtures("annotations_unchecked")
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: dd.optimize({}), r"spec: must be a spec or its TOML file, but got a dict\. For example dd\.load_spec"),
+        (lambda: dd.load_spec(None), "spec: must be a spec or its TOML file, but got a NoneType"),
+        (lambda: dd.psfs(DESIGN), 'run: must be a run or its folder, but got a Design. .* out="runs/NAME"'),
+        (lambda: dd.precompensate(PLATE), "run: must be a run or its folder, but got a LevelMap"),
+        (
+            lambda: dd.tolerance(DESIGN, process="stepper", draws="4"),
+            "draws: must be at least 1, a whole number, .*'4'",
+        ),
+        (lambda: dd.tolerance(DESIGN, process="stepper", draws=2.5), "draws: must be at least 1, a whole number"),
+        (lambda: dd.study(DESIGN, process="stepper").monte_carlo("4"), "draws: must be at least 1, a whole number"),
+        (
+            lambda: dd.tolerance(DESIGN, process="stepper", errors=["overlay_x"]),
+            "errors: must be a Mapping, but got a list",
+        ),
+        (lambda: dd.write_masks(DESIGN, "order", wafer=3), "wafer: must be a wafer or its TOML file, but got 3"),
+        (lambda: dd.write_masks(DESIGN, "order", patch=3), "patch: must be a Patch, but got an int"),
+        (lambda: fab.write_order("order", HEIGHT.height_m), r"level_map: must be a LevelMap, but got a ndarray\."),
+        (lambda: fab.write_level_map("map.npz", HEIGHT), "level_map: must be a LevelMap, but got a HeightMap"),
+        (lambda: fab.verify(PLATE), "order: must be a folder, or what write_order returned, but got a LevelMap"),
+    ],
+)
+def test_other_slips_of_a_notebook_are_told(call, told, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=told):
+        call()
+    assert not list(tmp_path.iterdir())
