@@ -5,7 +5,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from fab.process import MaskDisc, Process, Variation
 from fab.units import require_kind
 from sim.aperture import circle_coverage, displaced_cells, open_cells, outline_of
 from sim.camera import Camera, SpectralLine
-from sim.metrics import in_parts
+from sim.metrics import in_parts, zeroth_order
 from sim.optic import ViewedOptic, height_transmission
 from sim.propagation.pupil import DoeRows, SourceColumns
 from sim.rigorous.edge_optic import EdgeOptic, with_edges
@@ -34,6 +34,10 @@ from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import CellMaps, transmission_of
 from sim.threads import at_once
 from sim.tracing import is_traced, single, stacked
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 
 class FabricatedDoe(ViewedOptic):
@@ -86,6 +90,31 @@ class FabricatedDoe(ViewedOptic):
         """As of other DOEs; the transmission has the chrome already."""
         rows, columns = super().rows(line, source)
         return (rows if self.height_m is not None else rows._replace(coverage=None)), columns
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw its phase error, and the phase of its middle as drawn and as fabricated (`sim.plots.plate`)."""
+        from sim.plots.plate import plot_plate
+
+        return plot_plate(self, ax)
+
+    def _repr_html_(self) -> str:
+        """Table and picture for notebooks."""
+        from fab.figure import aperture_text, html_of, length_text
+
+        ny, nx = self.grid.shape
+        orders = zeroth_order(self)
+        rows = {
+            "cells": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
+            "clear aperture": aperture_text(self.camera.opening),
+            "substrate": self.camera.material,
+            "light": self.camera.light,
+            "errors": "none, as drawn" if self.height_m is not None else "as fabricated",
+            **{
+                f"0th order at {length_text(w)}": f"{100 * n:.3g} %"
+                for w, n in zip(self.wavelengths_m, orders, strict=True)
+            },
+        }
+        return html_of("DOE as fabricated", rows, self.plot())
 
     def with_camera(self, camera: Camera) -> "FabricatedDoe":
         """The same DOE before another lens or sensor; where that sees more oblique light than its own, less exact.

@@ -11,6 +11,7 @@ import doedesign as dd
 import fab
 import sim
 from fab.errors import InputError
+from tests.pictures import require_place_of_axes, require_whole
 
 PITCH_M, SIDE = 2e-6, 32
 GRID = fab.Grid((SIDE, SIDE), PITCH_M)
@@ -157,3 +158,23 @@ def test_other_slips_of_a_notebook_are_told(call, told, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=told):
         call()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("light", ["scalar", "edges"])
+def test_a_plate_as_fabricated_draws_itself(light):
+    """A notebook showed the names of its arrays."""
+    design = dd.Design(PLATE, replace(CAMERA, light=light))
+    drawn, deep = (design.fabricated(variation=fab.Variation(common_depth_scale=scale)) for scale in (0.0, 0.04))
+    for plate in (drawn, deep):
+        figure = plate.plot()
+        require_whole(figure)
+        text = plate._repr_html_()
+        assert "DOE as fabricated" in text
+        assert "0th order at 550 nm" in text
+        assert "data:image/png" in text
+    whole, before, after = (axes.images[0].get_array() for axes in deep.plot().axes[:3])
+    # The vortex has up to 3/4 of a wave, the etch 4 % too deep: floors lie lower, and phases are counted from the face.
+    assert before.shape == after.shape == (SIDE, SIDE)
+    assert np.abs(whole).max() == pytest.approx(0.03, abs=0.001 if light == "scalar" else 0.02)
+    assert np.abs(drawn.plot().axes[0].images[0].get_array()).max() < (1e-3 if light == "scalar" else 0.05)
+    require_place_of_axes(deep.plot)
