@@ -171,8 +171,12 @@ class PsfBank(eqx.Module):
             rows["light in the window"] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
             return html_of("PSFs", rows, self.plot())
         rows["lens"] = self.camera.lens_text
+        near, far = near_and_far(self.camera, self.depths_m)
         for name in ("throughput", "far_spot", "ring_to_disc"):
-            values = self.metric(name)
+            meant = {"near": near, "far": far, "all": self.depths_m}[METRICS[name].depths]
+            if not meant:
+                continue
+            values = np.asarray(self.metric(name))[:, [depth in meant for depth in self.depths_m]]
             rows[METRICS[name].label] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
         return html_of("PSFs", rows, self.plot())
 

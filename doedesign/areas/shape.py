@@ -212,6 +212,12 @@ class AreaTable:
 
         return plot_area(self, ax)
 
+    def _repr_html_(self) -> str:
+        """Its line and its picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of("Light on the area", {"area": self.describe()}, self.plot())
+
 
 @dataclass(frozen=True)
 class AreaTables:
@@ -260,6 +266,14 @@ class AreaTables:
         from doedesign.report.areas import plot_areas
 
         return plot_areas(self.tables, ax)
+
+    def _repr_html_(self) -> str:
+        """Its line and its picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of(
+            "Light on the areas", {f"area {k}": one.describe() for k, one in enumerate(self.tables)}, self.plot()
+        )
 
 
 def areas_of_design(design: Design, doe: CellOptic) -> tuple[AreaTable, ...]:

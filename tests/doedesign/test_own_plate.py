@@ -10,6 +10,7 @@ import pytest
 import doedesign as dd
 import fab
 import sim
+from doedesign.templates import template_text
 from fab.errors import InputError
 from tests.pictures import require_place_of_axes, require_whole
 
@@ -178,3 +179,37 @@ def test_a_plate_as_fabricated_draws_itself(light):
     assert np.abs(whole).max() == pytest.approx(0.03, abs=0.001 if light == "scalar" else 0.02)
     assert np.abs(drawn.plot().axes[0].images[0].get_array()).max() < (1e-3 if light == "scalar" else 0.05)
     require_place_of_axes(deep.plot)
+
+
+def test_a_bank_is_shown_with_the_numbers_that_are_meant_for_its_depths():
+    """Of a star and of light without a lens the ring:disc ratio was shown, and of near light the far spot."""
+    star, near = (sim.psf(PLATE, CAMERA, depths=depth)._repr_html_() for depth in ("inf", "1 mm"))
+    free = replace(CAMERA, focal_length_m=np.inf, distance_m=5e-3)
+    for shown in (star, sim.psf(PLATE, free)._repr_html_()):
+        assert "far spot" in shown
+        assert "ring:disc" not in shown
+    assert "ring:disc" in near
+    assert "far spot" not in near
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "words"),
+    [
+        ("fan_out", {"spots__count": [3, 3]}, "9 spots: "),
+        ("fan_out", {"spots__count": [3, 3], "spots__colours": ["638nm", "520nm"]}, "<th>520nm</th><td>9 spots: "),
+        ("diffuser", {"doe__samples": 256, "doe__aperture": "0.512 mm"}, "<th>area</th>"),
+        ("bifocal", {"doe__samples": 200, "doe__aperture": "0.4 mm"}, "<th>foci</th>"),
+    ],
+)
+def test_what_a_design_aims_at_is_shown_by_a_notebook(name, changes, words, tmp_path):
+    """Its table was an array of numbers."""
+    path = tmp_path / f"{name}.toml"
+    path.write_text(template_text(name))
+    if "spots__colours" in changes:
+        changes = {**changes, "optics__wavelengths": ["638 nm", "520 nm"], "optics__design_wavelength": "520 nm"}
+    design = dd.optimize(dd.load_spec(path, steps=2, **changes))
+    shown = [one for table in dd.fabricated(design).aimed.values() for one in [table._repr_html_()]]
+    assert shown
+    for text in shown:
+        assert words in text
+        assert "data:image/png" in text
