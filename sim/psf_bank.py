@@ -122,9 +122,8 @@ class PsfBank(eqx.Module):
     def throughput(self) -> Table:
         """Energy in the window, `[colour, depth]`."""
         if self.camera is None:
-            return (
-                jnp.sum(self.energy, (-2, -1)) if is_traced(self.energy) else np.sum(self.energy, (-2, -1), np.float64)
-            )
+            traced, sides = is_traced(self.energy), (-2, -1)
+            return jnp.sum(self.energy, sides) if traced else np.asarray(np.sum(self.energy, sides, np.float64))
         return self.metric("throughput")
 
     def far_spot(self) -> Table:

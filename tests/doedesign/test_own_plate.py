@@ -1,8 +1,11 @@
 """A plate of one's own, from an array of heights and without a spec: what takes it, and what is said of slips."""
 
+# What is given here is of other types than annotations say, on purpose.
+# pyright: reportArgumentType=false
+
 import json
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,10 +32,10 @@ DESIGN = dd.Design(PLATE, CAMERA, (), (np.inf,))
 @pytest.mark.parametrize(
     ("variation", "told"),
     [
-        (fab.Variation(overlay_x_m=cast(Any, 1e-6)), r"overlay_x_m: must have one value per mask, 2, but got 1e-06\. "),
-        (fab.Variation(overlay_x_m=cast(Any, "1 um")), r"must have one value per mask.*For example \(1e-6, 0\.0\)"),
-        (fab.Variation(overlay_x_m=cast(Any, ("1 um", 0.0))), "overlay_x_m: must be a number, metres, but got '1 um'"),
-        (fab.Variation(common_depth_scale=cast(Any, "3 %")), "must be a number, a share, 0.03 for 3 %, but got '3 %'"),
+        (fab.Variation(overlay_x_m=1e-6), r"overlay_x_m: must have one value per mask, 2, but got 1e-06\. "),
+        (fab.Variation(overlay_x_m="1 um"), r"must have one value per mask.*For example \(1e-6, 0\.0\)"),
+        (fab.Variation(overlay_x_m=("1 um", 0.0)), "overlay_x_m: must be a number, metres, but got '1 um'"),
+        (fab.Variation(common_depth_scale="3 %"), "must be a number, a share, 0.03 for 3 %, but got '3 %'"),
         ({"overlay_x_m": (1e-6, 0.0)}, r"variation: must be a fab\.Variation or a TOML file, but got \{"),
     ],
 )
@@ -43,28 +46,28 @@ def test_errors_of_a_plate_are_numbers_in_si_units(variation, told):
 
 @pytest.mark.usefixtures("annotations_unchecked")
 def test_a_process_and_a_draw_of_another_kind_are_told():
-    wrong = cast(Any, {"stock": "contact_aligner"})
+    wrong = {"stock": "contact_aligner"}
     with pytest.raises(InputError, match=r"process: must be a process or the name of one, but got \{"):
         DESIGN.fabricated(wrong)
     with pytest.raises(InputError, match=r"process: must be a process or the name of one, but got \{"):
         fab.check(PLATE, wrong)
     with pytest.raises(InputError, match='draw: must be the key of a plate of this study, but got "3"'):
-        DESIGN.fabricated("contact_aligner", seed=0, draw=cast(Any, 3))
+        DESIGN.fabricated("contact_aligner", seed=0, draw=3)
     with pytest.raises(InputError, match=r"process: must be a Process, but got a str\. For example fab\.process_from"):
-        sim.as_fabricated(PLATE, CAMERA, cast(Any, "contact_aligner"), fab.Variation())
+        sim.as_fabricated(PLATE, CAMERA, "contact_aligner", fab.Variation())
     with pytest.raises(InputError, match="process: levels: must be a Levels, but got an int"):
-        fab.Process(cast(Any, 4))
+        fab.Process(4)
     with pytest.raises(InputError, match="minimum_line_m: must be finite and not negative, in metres, but got '1 um'"):
-        fab.Process(LEVELS, minimum_line_m=cast(Any, "1 um"))
+        fab.Process(LEVELS, minimum_line_m="1 um")
     for spread in ((0.0, 1e-6), 1e-6):
         with pytest.raises(InputError, match=r"must be a mean and a sigma in SI units, .*fab\.Normal"):
-            fab.Process(LEVELS, spreads={"overlay_x_m[0]": cast(Any, spread)})
+            fab.Process(LEVELS, spreads={"overlay_x_m[0]": spread})
     with pytest.raises(InputError, match="mean and sigma must be finite numbers"):
-        fab.Process(LEVELS, spreads={"overlay_x_m[0]": fab.Normal(cast(Any, "1 um"), 0.0)})
+        fab.Process(LEVELS, spreads={"overlay_x_m[0]": fab.Normal("1 um", 0.0)})
 
 
 def test_a_level_map_is_fabricated_as_its_numbers_are():
-    errors = fab.Variation(overlay_x_m=cast(Any, [0.2e-6, 0.0]), cd_bias_m=cast(Any, np.array([1e-7, 0.0])))
+    errors = fab.Variation(overlay_x_m=[0.2e-6, 0.0], cd_bias_m=np.array([1e-7, 0.0]))
     assert errors.overlay_x_m == (0.2e-6, 0.0)
     assert hash(errors) == hash(fab.Variation(overlay_x_m=(0.2e-6, 0.0), cd_bias_m=(1e-7, 0.0)))
     made, same = (sim.as_fabricated(one, CAMERA, fab.Process(LEVELS), errors) for one in (PLATE, PLATE.level))
@@ -161,6 +164,11 @@ def test_other_slips_of_a_notebook_are_told(call, told, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def shown_in(figure: Any) -> list[Any]:
+    """The arrays of its three panels."""
+    return [axes.images[0].get_array() for axes in figure.axes[:3]]
+
+
 @pytest.mark.parametrize("light", ["scalar", "edges"])
 def test_a_plate_as_fabricated_draws_itself(light):
     """A notebook showed the names of its arrays."""
@@ -173,11 +181,11 @@ def test_a_plate_as_fabricated_draws_itself(light):
         assert "DOE as fabricated" in text
         assert "0th order at 550 nm" in text
         assert "data:image/png" in text
-    whole, before, after = (axes.images[0].get_array() for axes in deep.plot().axes[:3])
+    whole, before, after = shown_in(deep.plot())
     # The vortex has up to 3/4 of a wave, the etch 4 % too deep: floors lie lower, and phases are counted from the face.
     assert before.shape == after.shape == (SIDE, SIDE)
     assert np.abs(whole).max() == pytest.approx(0.03, abs=0.001 if light == "scalar" else 0.02)
-    assert np.abs(drawn.plot().axes[0].images[0].get_array()).max() < (1e-3 if light == "scalar" else 0.05)
+    assert np.abs(shown_in(drawn.plot())[0]).max() < (1e-3 if light == "scalar" else 0.05)
     require_place_of_axes(deep.plot)
 
 

@@ -1,6 +1,10 @@
 """Slips of those who call `sim` from Python: what is no beam, no camera, no bank is told in words."""
 
+# What is given here is of other types than annotations say, on purpose.
+# pyright: reportArgumentType=false
+
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,7 +70,7 @@ def test_slips_are_told_in_words(call, told):
 
 @pytest.mark.usefixtures("annotations_unchecked")
 def test_lists_of_a_beam_are_taken():
-    beam = GaussianBeam([1e-3, 2e-3])  # type: ignore[arg-type]
+    beam = GaussianBeam([1e-3, 2e-3])
     assert beam == GaussianBeam((1e-3, 2e-3))
     assert replace(CAMERA, beam=beam) == replace(CAMERA, beam=GaussianBeam((1e-3, 2e-3)))
 
@@ -79,7 +83,7 @@ def test_psfs_without_a_camera_are_drawn_and_summed(sines, rng):
     bank = PsfBank(energy, ("red", "green"), (0.05, 0.1, np.inf), 1e-3 if sines else 2e-6, sines=sines)
     np.testing.assert_allclose(bank.throughput(), energy.sum((2, 3), dtype=np.float64), rtol=1e-6)
     assert "light in the window" in bank._repr_html_()
-    figure = bank.plot()
+    figure: Any = bank.plot()
     require_whole(figure)
     require_place_of_axes(bank.plot)
     panes = [axes for axes in figure.axes if axes.images]
