@@ -40,8 +40,8 @@ from doedesign.runs.folder import (
     inputs_of_run,
     is_finished,
     named,
-    open_run,
     require_room,
+    run_of,
 )
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
@@ -234,7 +234,7 @@ def precompensate(
     """
     if not 0 <= evaluations <= _MOST:
         raise InputError("evaluations", f"must lie from 0 to {_MOST}", evaluations, f"{EVALUATIONS} are usual.")
-    run = source if isinstance(source, Run) else open_run(Path(source))
+    run = run_of(source)
     drawn = open_design(run, False)
     assert drawn.spec is not None  # that of its run
     made_by = _repeating(resolve_process(process, drawn.levels, drawn.spec.process), drawn.spec, random)

@@ -17,7 +17,7 @@ from doedesign.runs.folder import (
     input_digests,
     load_checkpoint,
     named,
-    open_run,
+    run_of,
     save_checkpoint,
 )
 from doedesign.runs.level_maps import open_design
@@ -106,7 +106,7 @@ def refine(
             several wavelengths, tilted light, a cell that is too large, or a folder that belongs to something else.
     """
     require_fmmax()
-    run = source if isinstance(source, Run) else open_run(Path(source))
+    run = run_of(source)
     cell = _cell_of(open_design(run, False))
     terms = _terms_of(cell, terms)
     steps = steps if steps is not None else ROW_STEPS if 1 in cell.grid.shape else STEPS

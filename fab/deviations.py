@@ -142,8 +142,9 @@ class Variation:
     """The errors of one DOE; all zero is a DOE exactly as drawn.
 
     Lengths are metres, angles radians. A per-mask error is empty (zero for every mask) or has one value per mask, mask
-    0 first. Coordinates are those of the height map (`[y, x]`, +y toward higher rows, origin in the middle of the DOE);
-    rotation and magnification of a mask, and the wafer's non-uniformity, act about the middle of the wafer.
+    0 first; lists become tuples. Coordinates are those of the height map (`[y, x]`, +y toward higher rows, origin in
+    the middle of the DOE); rotation and magnification of a mask, and the wafer's non-uniformity, act about the middle
+    of the wafer.
 
     Attributes:
         repeats: how often each mask was etched more than once: -1 missed, 1 doubled; empty for none.
@@ -203,6 +204,12 @@ class Variation:
     particles: tuple[MaskDisc, ...] = ()
     pinholes: tuple[Disc, ...] = ()
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, error in DEVIATIONS.items():
+            values: Any = getattr(self, name)
+            if error.per_mask and (isinstance(values, list) or getattr(values, "ndim", 0) == 1):
+                object.__setattr__(self, name, tuple(values))
 
     @property
     def nominal(self) -> bool:

@@ -230,7 +230,7 @@ def variation_at(process: Process, seed: int, plate_m: float, key: str) -> Varia
         raise InputError("seed", "must be a whole number of 0 or more", seed, "Change it.")
     seed, cause = int(seed), None
     try:
-        match key.split("/"):
+        match key.split("/") if isinstance(key, str) else []:
             case ["nominal"]:
                 return Variation()
             case ["expected"]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.units import number_of
 
 # One part in so many keeps points that are exactly on a rim inside it.
 SLACK = 1e-12
@@ -46,25 +47,30 @@ class Grid:
         pitch_m: edge of one pixel, metres.
 
     Raises:
-        InputError: a count that is no integer or below one, or a pitch that is not from 1e-20 m to 1e20 m.
+        InputError: a shape that is not two integers of at least one, or a pitch that is not a number from 1e-20 m to
+            1e20 m.
     """
 
     shape: tuple[int, int]
     pitch_m: float
 
     def __post_init__(self) -> None:
-        ny, nx = self.shape
+        try:
+            ny, nx = self.shape
+        except (TypeError, ValueError) as error:
+            rule, cure = "must be two counts of pixels (ny, nx)", "Give array.shape of a map [y, x]."
+            raise InputError("grid: shape", rule, repr(self.shape), cure) from error
         if not all(isinstance(n, Integral) for n in (ny, nx)):
             rule = "must count whole pixels"
             raise InputError("grid: shape", rule, self.shape, "Give integers, such as array.shape.")
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
         object.__setattr__(self, "shape", (int(ny), int(nx)))  # of numpy, they would not go into JSON
-        object.__setattr__(self, "pitch_m", float(self.pitch_m))
-        if not _PITCHES_M[0] <= self.pitch_m <= _PITCHES_M[1]:
-            raise InputError(
-                "grid: pitch", "must be positive, from 1e-20 m to 1e20 m", self.pitch_m, "Give the pixel pitch."
-            )
+        pitch_m = number_of(self.pitch_m)
+        if not _PITCHES_M[0] <= pitch_m <= _PITCHES_M[1]:
+            rule = "must be positive, from 1e-20 m to 1e20 m"
+            raise InputError("grid: pitch", rule, repr(self.pitch_m), "Give the pixel pitch in metres, 2e-6 for 2 um.")
+        object.__setattr__(self, "pitch_m", pitch_m)
 
     @property
     def extent_m(self) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from fab.errors import InputError
 from fab.files import read_npy
 from fab.grid import Grid
 from fab.pictures import TIFF_FILES, read_pixels
-from fab.units import format_length, metres
+from fab.units import format_length, metres, require_kind
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,12 +35,13 @@ class HeightMap:
     """A relief on its raster.
 
     Attributes:
-        height_m: heights above the deepest floor, metres, ``[y, x]``, float32 or float64, none negative.
+        height_m: heights above the deepest floor, metres, ``[y, x]``, float32 or float64, none negative; lists become
+            an array.
         grid: the raster.
         aperture: outline of the relief (`fab.aperture`); a number is the diameter of a round one, metres.
 
     Raises:
-        InputError: the shape is not the grid's, or a height is NaN, infinite or negative.
+        InputError: an argument of another kind, the shape is not the grid's, or a height is NaN, infinite or negative.
     """
 
     height_m: NDArray[np.floating]
@@ -48,6 +49,9 @@ class HeightMap:
     aperture: Aperture | float
 
     def __post_init__(self) -> None:
+        require_kind("grid", self.grid, Grid, "Give a fab.Grid(shape, pitch_m).")
+        require_filled(self.height_m, "height map")
+        object.__setattr__(self, "height_m", as_array(self.height_m, "height map"))
         if self.height_m.shape != self.grid.shape:
             got = f"{self.height_m.shape} on {self.grid.shape}"
             raise InputError("height map", "must have the grid's shape", got, "Use its own grid.")
@@ -96,6 +100,14 @@ def require_filled(values: NDArray[Any], where: str) -> None:
     if np.ma.is_masked(values):
         got = f"{np.ma.count_masked(values)} masked values"
         raise InputError(where, "every pixel must have a value", got, "Fill them, as array.filled(0) does.")
+
+
+def as_array(values: Any, where: str) -> NDArray[Any]:
+    """Return an array, or lists of numbers as one; an `InputError` for lists that are no array."""
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise InputError(where, "must be an array [y, x]", "rows of different lengths", "Fill them.") from error
 
 
 def require_heights(height_m: NDArray[Any], where: str) -> None:

@@ -19,9 +19,9 @@ from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import sha256_bytes
 from fab.grid import Grid
-from fab.height import HeightMap, require_filled
+from fab.height import HeightMap, as_array, require_filled
 from fab.levels import Levels, height_of, level_map_from_planes, planes, quantise, quantise_wrapped, require_levels
-from fab.units import format_length
+from fab.units import format_length, require_kind
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,8 +46,8 @@ class LevelMap:
         name: the owner's name for it.
 
     Raises:
-        InputError: the array is no level map of the staircase, its shape is not the grid's, or the aperture does not
-            fit the raster.
+        InputError: an argument of another kind, the array is no level map of the staircase, its shape is not the
+            grid's, or the aperture does not fit the raster.
     """
 
     level: NDArray[np.uint8]
@@ -57,8 +57,10 @@ class LevelMap:
     name: str = "doe"
 
     def __post_init__(self) -> None:
+        require_kind("levels", self.levels, Levels, "Give a fab.Levels(count, step_m).")
+        require_kind("grid", self.grid, Grid, "Give a fab.Grid(shape, pitch_m).")
         require_filled(self.level, "level map")
-        checked = require_levels(np.asarray(self.level), self.levels)
+        checked = require_levels(as_array(self.level, "level map"), self.levels)
         if checked.shape != self.grid.shape:
             rule = f"must have the grid's shape {self.grid.shape}"
             raise InputError("level map", rule, checked.shape, "Use its own grid.")
@@ -83,8 +85,11 @@ class LevelMap:
         """Give every pixel of a height map the nearest level; if `wrapped`, heights repeat after one wave.
 
         Raises:
-            InputError: a height above the staircase that is not to be wrapped, or the aperture does not fit.
+            InputError: something other than a height map or levels, a height above the staircase that is not to be
+                wrapped, or the aperture does not fit.
         """
+        require_kind("height", height, HeightMap, "Give a fab.HeightMap(height_m, grid, aperture).")
+        require_kind("levels", levels, Levels, "Give a fab.Levels(count, step_m).")
         level = (quantise_wrapped if wrapped else quantise)(height.height_m, levels)
         return cls(level, levels, height.grid, height.relief, name)
 
@@ -160,6 +165,7 @@ def level_digest(level: NDArray[np.uint8]) -> str:
 
 def write_level_map(path: str | Path, level_map: LevelMap) -> None:
     """Write a level map without loss to `path`; the same `level_map` gives the same bytes. Lengths in it are metres."""
+    require_kind("level_map", level_map, LevelMap, "A design has one: design.level_map.")
     levels, grid = level_map.levels, level_map.grid
     header = {
         "format": FORMAT,
@@ -188,7 +194,8 @@ def read_level_map(path: str | Path) -> LevelMap:
         if header["format"] != FORMAT:
             raise InputError(str(path), f'must say format "{FORMAT}"', repr(header["format"]), cure)
         ny, nx = (int(n) for n in header["shape"])
-        levels = Levels(int(header["levels"]), float(header["level_step_m"]), tuple(header["etch_depths_m"]))
+        depths_m = tuple(float(depth) for depth in header["etch_depths_m"])
+        levels = Levels(int(header["levels"]), float(header["level_step_m"]), depths_m)
         grid = Grid((ny, nx), float(header["pitch_m"]))
         packed = arrays["planes"]
         if packed.shape != (levels.bits, ny, -(-nx // 8)):  # before memory is asked for by the header alone

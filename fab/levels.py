@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.height import refuse_where, require_heights
-from fab.units import format_length
+from fab.units import format_length, number_of
 
 # Numbers of levels; the most take six masks.
 FEWEST, MOST = 2, 64
@@ -28,8 +28,8 @@ FEWEST, MOST = 2, 64
 _ROWS = 256
 # Depths that agree so closely with 2^k steps are meant to be 2^k steps.
 _SAME = 1e-9
-# Far beyond what is made, so that sums of depths stay numbers.
-_LONGEST_M = 1e3
+# No thin element is so high: a longer step or depth is in other units.
+_LONGEST_M = 1e-3
 # A map that reaches so high is not in metres: no staircase is so deep.
 _UNLIKELY_M = 1e-4
 # Heights of two levels must differ by this part of a step. No process tells less apart, and single precision keeps a
@@ -48,8 +48,8 @@ class Levels:
         depths_m: how deep each mask etches, metres, first mask first; ``2**k * step_m`` where none are given.
 
     Raises:
-        InputError: a count that is not a whole number from 2 to 64, a step or a depth that is not positive or longer
-            than 1 km, or depths that are not one per mask or leave two levels at one height.
+        InputError: a count that is not a whole number from 2 to 64, a step or a depth that is not a positive number of
+            metres or longer than 1 mm, or depths that are not one per mask or leave two levels at one height.
     """
 
     count: int
@@ -65,19 +65,17 @@ class Levels:
             cure = "For example 6 or 16; powers of two use every set of masks."
             raise InputError("levels", f"must be a whole number from {FEWEST} to {MOST}", self.count, cure)
         object.__setattr__(self, "count", count)
-        if not 0 < self.step_m <= _LONGEST_M:
-            raise InputError(
-                "level step", "must be positive and at most 1 km", self.step_m, 'Give one such as "75 nm".'
-            )
+        _require_height("level step", self.step_m)
+        if not isinstance(self.depths_m, tuple | list | np.ndarray):
+            rule = "must be a depth for each mask"
+            raise InputError("etch depths", rule, repr(self.depths_m), "For example (75e-9, 150e-9).")
+        for depth in self.depths_m:
+            _require_height("etch depths", depth)
         binary = tuple(2**bit * self.step_m for bit in range(self.bits))
         depths = tuple(float(depth) for depth in self.depths_m)
         if depths and len(depths) != self.bits:
             rule = f"{self.count} levels must have {self.bits} etches"
             raise InputError("etch depths", rule, f"{len(depths)} depths", "Give one depth per mask, first mask first.")
-        for depth in depths:
-            if not 0 < depth <= _LONGEST_M:
-                cure = 'Give depths such as "75 nm".'
-                raise InputError("etch depths", "must be positive and at most 1 km", depth, cure)
         even = all(math.isclose(depth, due, rel_tol=_SAME) for depth, due in zip(depths, binary, strict=False))
         object.__setattr__(self, "depths_m", binary if even else depths)
         if not even:
@@ -153,6 +151,13 @@ class Levels:
         return self.depths_m[bit]
 
 
+def _require_height(name: str, height_m: object) -> None:
+    """Raise an InputError for a height that no staircase has, the value of `name`."""
+    if not 0 < number_of(height_m) <= _LONGEST_M:
+        rule, cure = "must be positive and at most 1 mm, in metres", 'Give 75e-9 for 75 nm; in a spec, "75 nm".'
+        raise InputError(name, rule, repr(height_m), cure)
+
+
 def require_levels(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
     """Check that integers ``[y, x]`` are a level map of this staircase; return them as a C-ordered uint8 array."""
     cure = "Quantise the height map with these levels first."
@@ -173,7 +178,7 @@ def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8
     """
     require_heights(height_m, "height map")
     top = (levels.count - 0.5) * levels.step_m if levels.is_binary else levels.total_m + 0.5 * levels.step_m
-    cure = "Wrap the map to one wave of height, or choose more levels or a larger step."
+    cure = "Wrap the map to one wave of height (wrapped=True), or choose more levels or a larger step."
     if height_m.max() >= _UNLIKELY_M:
         cure = 'Heights are taken as metres; of a map in other units give the scale, such as "1 nm".'
     # One part in 1e6 of a step keeps a float32 height that means exactly half a step above the top.

@@ -23,7 +23,7 @@ from fab.deviations import (
 from fab.errors import InputError
 from fab.files import IF_ANY
 from fab.levels import Levels
-from fab.units import MM, UM
+from fab.units import MM, UM, number_of, require_kind
 
 __all__ = [
     "DEVIATIONS",
@@ -76,7 +76,7 @@ class Defects:
     def __post_init__(self) -> None:
         for field_ in fields(self):
             value = getattr(self, field_.name)
-            if not 0 <= value < math.inf:
+            if not 0 <= number_of(value) < math.inf:
                 where = f"defects: {field_.name}"
                 raise InputError(where, "must be finite and not negative", value, "Give 0 or more.")
         if self.missed + self.doubled > 1:
@@ -120,6 +120,7 @@ class Process:
     name: str = "ideal"
 
     def __post_init__(self) -> None:
+        require_kind("process: levels", self.levels, Levels, "Give a fab.Levels(count, step_m).")
         masks = tuple(range(self.levels.bits))
         order = tuple(self.order) or tuple(sorted(masks, key=self.levels.etch_depth_m))
         if tuple(sorted(order)) != masks:
@@ -132,10 +133,9 @@ class Process:
         if self.tone not in ("clear", "dark"):
             raise InputError("process: tone", 'must be "clear" or "dark"', self.tone, "Choose one of them.")
         for name in ("minimum_line_m", "minimum_space_m", "wafer_radius_m"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(
-                    f"process: {name}", "must be finite and not negative", getattr(self, name), "Give 0 or more."
-                )
+            if not 0 <= number_of(getattr(self, name)) < math.inf:
+                rule, cure = "must be finite and not negative, in metres", "Give 0 or more, such as 1e-6."
+                raise InputError(f"process: {name}", rule, repr(getattr(self, name)), cure)
         if self.reduction < 1:
             raise InputError("process: reduction", "must be 1 or more", self.reduction, "For example 5.")
         if not math.hypot(*self.die_m) <= self.wafer_radius_m:
@@ -149,7 +149,13 @@ class Process:
                 raise InputError(
                     f"process: spreads: {name}", "must be a known error", name, f"One of {', '.join(known)}."
                 )
-            if not (math.isfinite(spread.mean) and 0 <= spread.sigma < math.inf):
+            if not isinstance(spread, Normal):
+                rule, cure = "must be a mean and a sigma in SI units", "For example fab.Normal(0.0, 0.5e-6)."
+                raise InputError(f"process: spreads: {name}", rule, repr(spread), cure)
+            if not all(map(math.isfinite, map(number_of, spread))):
+                rule = "mean and sigma must be finite numbers"
+                raise InputError(f"process: spreads: {name}", rule, spread, "For example fab.Normal(0.0, 0.5e-6).")
+            if spread.sigma < 0:
                 raise InputError(
                     f"process: spreads: {name}", "sigma must be finite and not negative", spread, "Give 0 or more."
                 )

@@ -99,7 +99,7 @@ def process_from(given: Process | str | None, levels: Levels) -> Process:
             cure = "Give a process for this design."
             raise InputError("process", f"must be for {levels}", process.levels, cure)
         return process
-    if given not in known:
+    if not isinstance(given, str) or given not in known:
         raise InputError("process", "must be a process or the name of one", repr(given), f"Name {' or '.join(known)}.")
     return known[given].process(levels)
 

@@ -84,13 +84,27 @@ def metres(value: float | str, name: str = "length", *, infinite: bool = False) 
             return parse_length(value)
         except ValueError as error:
             raise InputError(name, rule, repr(value), cure) from error
-    try:
-        number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
-    except OverflowError:  # an integer beyond all floats
-        number = math.inf
+    number = number_of(value)
     if not math.isfinite(number):
         raise InputError(name, rule, repr(value), cure)
     return number
+
+
+def number_of(value: object) -> float:
+    """Return a real number as a float, infinite if it is beyond all floats; NaN for anything else, such as text."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:  # an integer beyond all floats
+        return math.inf
+
+
+def require_kind(name: str, value: object, kind: type, cure: str) -> None:
+    """Raise an `InputError` unless a value is of a kind, the value of `name`; `cure` says how to get one."""
+    if not isinstance(value, kind):
+        article = "an" if type(value).__name__[0] in "aeiou" else "a"
+        raise InputError(name, f"must be a {kind.__name__}", f"{article} {type(value).__name__}", cure)
 
 
 def format_angle(angle_rad: float) -> str:

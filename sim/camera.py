@@ -7,7 +7,7 @@ out of focus, or one without a lens, leaves a quadratic remainder (`Camera.curva
 
 import math
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -16,8 +16,8 @@ from jaxtyping import Complex, Float
 from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.units import DEGREES, PlaceUnit, format_length
-from sim.illumination import Beam, EvenBeam, beam_amplitude, beam_irradiance
+from fab.units import DEGREES, PlaceUnit, format_length, number_of
+from sim.illumination import Beam, EvenBeam, GaussianBeam, MeasuredBeam, beam_amplitude, beam_irradiance
 from sim.lens import IDEAL, Distortion, Mapping, check_lens, direction_sines, distorted_place, image_place, sines_at
 from sim.material import fresnel_transmission, material, refractive_index, waves_per_metre
 
@@ -74,11 +74,20 @@ def _numbers(where: str, given: Any) -> tuple[float, ...]:
 
 def _require_length(name: str, value: Any, *, signed: bool = False, infinite: bool = False) -> None:
     """Raise an InputError unless a value is a number of metres: finite and above 0, unless other ones will do, too."""
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    number = number_of(value)
     if (math.isfinite(number) or (infinite and number == math.inf)) and (signed or number > 0):
         return
     rule = f"must be metres, a{'' if signed else ' positive'} number{' or infinity' if infinite else ' that is finite'}"
     raise InputError(name, rule, repr(value), "For example 5e-3 for 5 mm.")
+
+
+def require_same_grid(camera: "Camera", grid: Grid) -> None:
+    """Raise an InputError unless the DOE of a camera lies on this grid, that of a plate."""
+    if camera.grid != grid:
+        shown, own = (
+            f"{one.shape[0]} x {one.shape[1]} cells of {format_length(one.pitch_m)}" for one in (grid, camera.grid)
+        )
+        raise InputError("camera", f"must have the grid of the plate, {shown}", own, "Make it with the plate's grid.")
 
 
 class SpectralLine(NamedTuple):
@@ -158,8 +167,9 @@ class Camera:
         self._require_kinds()
         self._require_lengths()
         self._require_opening()
-        if not 0 < self.fill <= 1:
-            raise InputError("fill", "must lie above 0, up to 1", self.fill, "Give the side of a pixel over its pitch.")
+        if not 0 < number_of(self.fill) <= 1:
+            cure = "Give the side of a pixel over its pitch."
+            raise InputError("fill", "must lie above 0, up to 1", repr(self.fill), cure)
         if math.isinf(self.focal_length_m) != (self.distance_m is not None):
             got = f"a focal length of {self.focal_length_m:g} m and a distance of {self.distance_m} m"
             rule, cure = "a camera has a lens, or a sensor at a distance", "Give a distance without a lens only."
@@ -193,6 +203,9 @@ class Camera:
         if not isinstance(colours, tuple) or not all(isinstance(one, Colour) for one in colours):
             cure = 'For example (sim.Colour("green", (550e-9,), (1.0,)),).'
             raise InputError("colours", "must be colour channels", repr(colours), cure)
+        if not isinstance(self.beam, GaussianBeam | MeasuredBeam | EvenBeam | None):
+            cure = "For example sim.GaussianBeam((1e-3, 1e-3)), or None for plane light."
+            raise InputError("beam", "must be a beam of sim", repr(self.beam), cure)
         if not isinstance(self.window, Integral) or isinstance(self.window, bool) or self.window < 1:
             rule = "must be a whole number of pixels, at least 1, for both axes"
             raise InputError("window", rule, repr(self.window), "For example 128.")

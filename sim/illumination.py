@@ -21,10 +21,23 @@ from jaxtyping import Complex, Float
 from scipy.ndimage import map_coordinates
 
 from fab.aperture import Aperture
+from fab.errors import InputError
 from fab.grid import Grid
+from fab.height import as_array
+from fab.units import number_of
 
 _REST = 1e-3  # share of the weakest modes that is left out
 Pair = tuple[float, float]
+
+
+def _require_pairs(beam: Any, *names: str) -> None:
+    """Make tuples of pairs of numbers (y, x) of a beam; an InputError for anything else."""
+    for name in names:
+        value = getattr(beam, name)
+        pair = tuple(value) if isinstance(value, tuple | list | np.ndarray) else ()
+        if len(pair) != 2 or not all(np.isfinite(number_of(one)) for one in pair):
+            raise InputError(f"beam: {name}", "must be two numbers (y, x)", repr(value), "For example (0.0, 0.01).")
+        object.__setattr__(beam, name, pair)
 
 
 @dataclass(frozen=True)
@@ -40,6 +53,9 @@ class GaussianBeam:
         angle_rad: angles (y, x) between its axis and that of the DOE, radians, positive where light travels toward +y
             or +x; the sensor's window follows.
         tilt_rad: angles (y, x) added to these, radians; the sensor's window stays.
+
+    Raises:
+        InputError: radii that are not two positive lengths, a beam quality below 1, or anything but numbers.
     """
 
     radius_m: Pair
@@ -50,10 +66,17 @@ class GaussianBeam:
     tilt_rad: Pair = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (np.shape(self.radius_m) == (2,) and all(0 < radius < np.inf for radius in self.radius_m)):
-            raise ValueError(f"`radius_m` must be two positive lengths (y, x), but got {self.radius_m}")
-        if not all(1 <= quality < np.inf for quality in self.m_squared):
-            raise ValueError(f"`m_squared` must be at least 1 and finite, but got {self.m_squared}")
+        given: Any = self.radius_m
+        radii = given if isinstance(given, tuple | list | np.ndarray) and len(given) == 2 else (0.0,)
+        if not all(0 < number_of(radius) < np.inf for radius in radii):
+            rule, cure = "must be two positive lengths (y, x), in metres", "For example (1e-3, 1e-3)."
+            raise InputError("beam: radius_m", rule, repr(given), cure)
+        _require_pairs(self, "radius_m", "m_squared", "centre_m", "angle_rad", "tilt_rad")
+        if not all(quality >= 1 for quality in self.m_squared):
+            raise InputError("beam: m_squared", "must be at least 1 and finite", self.m_squared, "Give (1.0, 1.0).")
+        if not np.isfinite(number_of(self.waist_distance_m)):
+            rule = "must be a finite number of metres"
+            raise InputError("beam: waist_distance_m", rule, repr(self.waist_distance_m), "For example 0.1.")
 
     @cached_property
     def _modes(self) -> list[tuple[float, int, int]]:
@@ -134,6 +157,10 @@ class MeasuredBeam:
         centre_m: place (y, x) of the picture's middle on the DOE, metres.
         angle_rad: angles (y, x) of its axis, radians, which the sensor's window follows.
         tilt_rad: angles (y, x) added to these, radians; the window stays.
+
+    Raises:
+        InputError: an intensity that is no array `[y, x]` of numbers, is negative or nowhere positive, pixels without a
+            width, or anything but numbers.
     """
 
     intensity: Float[np.ndarray, "y x"] = field(repr=False)
@@ -143,8 +170,21 @@ class MeasuredBeam:
     tilt_rad: Pair = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (np.all(np.isfinite(self.intensity)) and np.min(self.intensity) >= 0 < np.max(self.intensity)):
-            raise ValueError("`intensity` must be finite, nowhere negative and somewhere positive, but it is not")
+        picture = as_array(self.intensity, "beam: intensity")
+        if picture.ndim != 2 or picture.size == 0 or picture.dtype.kind not in "fiu":
+            rule, got = "must be an array of numbers [y, x]", f"{picture.dtype} of shape {picture.shape}"
+            raise InputError("beam: intensity", rule, got, "Give one plane of a picture.")
+        if not (np.all(np.isfinite(picture)) and np.min(picture) >= 0 < np.max(picture)):
+            rule, got = (
+                "must be finite, nowhere negative and somewhere positive",
+                f"{np.min(picture)} to {np.max(picture)}",
+            )
+            raise InputError("beam: intensity", rule, got, "Take the background off, and set what is below it to 0.")
+        if not 0 < number_of(self.pixel_m) < np.inf:
+            rule, cure = "must be a positive number of metres", "For example 5e-6 for 5 um."
+            raise InputError("beam: pixel_m", rule, repr(self.pixel_m), cure)
+        object.__setattr__(self, "intensity", picture)
+        _require_pairs(self, "centre_m", "angle_rad", "tilt_rad")
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
@@ -192,6 +232,9 @@ class EvenBeam:
         distance_m: distance of the point before the DOE that it comes from, metres; infinite for a plane wave.
         angle_rad: angles (y, x) of its chief ray, radians, which the sensor's window follows.
         tilt_rad: angles (y, x) added to these, radians; the window stays.
+
+    Raises:
+        InputError: a distance that is not positive, or anything but numbers.
     """
 
     distance_m: float = np.inf
@@ -199,8 +242,10 @@ class EvenBeam:
     tilt_rad: Pair = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not self.distance_m > 0:
-            raise ValueError(f"`distance_m` must be positive, but got {self.distance_m}")
+        if not number_of(self.distance_m) > 0:
+            rule, cure = "must be positive, a number of metres", "For example 0.5, or infinity for a plane wave."
+            raise InputError("beam: distance_m", rule, repr(self.distance_m), cure)
+        _require_pairs(self, "angle_rad", "tilt_rad")
 
     @property
     def shares(self) -> tuple[float, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.errors import InputError
+from fab.units import number_of
 
 Mapping = Literal["sine", "tangent"]
 Distortion = tuple[float, float]
@@ -90,7 +91,8 @@ def check_lens(mapping: str, distortion: Distortion, corner: float, key: Callabl
     if mapping not in get_args(Mapping):
         rule = f"must be one of {', '.join(get_args(Mapping))}"
         raise InputError(key("mapping"), rule, repr(mapping), 'Use "tangent" for a lens without distortion.')
-    if len(distortion) != 2 or not all(map(math.isfinite, distortion)):
+    given: Any = distortion
+    if not isinstance(given, tuple | list) or len(given) != 2 or not all(map(math.isfinite, map(number_of, given))):
         rule = "must be two finite numbers, k1 and k2"
         raise InputError(key("distortion"), rule, f"{distortion}", "Use (0, 0) for none.")
     if mapping == "sine" and not any(distortion):

@@ -44,7 +44,12 @@ class Material:
     def index(self, wavelength_m: float) -> float:
         """Refractive index n at a vacuum wavelength in metres; an InputError outside the range of the published fit."""
         low, high = self.range_m
-        if not low <= wavelength_m <= high:
+        try:
+            inside = bool(low <= wavelength_m <= high)
+        except (TypeError, ValueError) as error:  # text, or several
+            rule, cure = "the wavelength must be a number of metres", "Give 550e-9 for 550 nm."
+            raise InputError(f"material {self.name}", rule, repr(wavelength_m), cure) from error
+        if not inside:
             rule = f"the wavelength must lie in {low * 1e9:.0f}-{high * 1e9:.0f} nm, the range of its published fit"
             cure = "Choose a wavelength inside the range or another material."
             raise InputError(f"material {self.name}", rule, f"{wavelength_m * 1e9:.6g} nm", cure)

@@ -19,9 +19,10 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from fab.errors import InputError
-from fab.height import refuse_where, require_filled
+from fab.height import HeightMap, refuse_where, require_filled
+from fab.level_map import LevelMap
 from sim.aperture import open_cells
-from sim.camera import Camera, SpectralLine
+from sim.camera import Camera, SpectralLine, require_same_grid
 from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
@@ -260,11 +261,16 @@ def height_deviation(
 def heights_on(camera: Camera, height_m: Any) -> Float[Array, "y x"]:
     """Heights `[y, x]` of the cells of a camera's grid, metres, in single precision; traced ones are taken as they are.
 
+    A height map and a level map of `fab` have theirs.
+
     Raises:
         ValueError: another shape than the grid's.
-        InputError: masked values, something other than real numbers, a height that is not finite, or one of more than
-            1 mm, which is in other units.
+        InputError: a map of `fab` on another grid, masked values, something other than real numbers, a height that is
+            not finite, or one of more than 1 mm, which is in other units.
     """
+    if isinstance(height_m, HeightMap | LevelMap):
+        require_same_grid(camera, height_m.grid)
+        height_m = height_m.height_m
     if not is_traced(height_m):
         require_filled(height_m, "height_m")
         kind = np.asarray(height_m).dtype
@@ -303,6 +309,8 @@ class HeightOptic(CellOptic):
     @classmethod
     def of(cls, camera: Camera, height_m: Any = None) -> "HeightOptic":
         """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); flat for the bare lens.
+
+        A height map or a level map of `fab` will do, too.
 
         Errors are those of `heights_on`.
         """

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fab.errors import InputError
-from fab.units import metres
+from fab.units import metres, number_of
 from sim.camera import Camera, SpectralLine
 from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, participation
 from sim.optic import ON_AXIS, CellOptic, Optic, Propagation
@@ -53,7 +53,8 @@ class PsfBank(eqx.Module):
         sines: whether `pixel_m` is a direction sine, where no camera tells.
 
     Raises:
-        InputError: energies that have not one entry for each colour and depth, or depths that are not positive.
+        InputError: energies that have not one entry for each colour and depth, or depths or pixels that are not
+            positive.
     """
 
     energy: Energies
@@ -66,11 +67,16 @@ class PsfBank(eqx.Module):
 
     def __check_init__(self) -> None:
         """Refuse energies that belong to other colours or depths."""
+        for name, example in (("colours", '("green",)'), ("depths_m", "(0.05, np.inf)")):
+            if not isinstance(getattr(self, name), tuple | list):
+                raise InputError(name, "must be one for each PSF", repr(getattr(self, name)), f"For example {example}.")
         wanted, shape = (len(self.colours), len(self.depths_m)), np.shape(self.energy)
         if len(shape) != 4 or shape[:2] != wanted:
             rule = f"must be [colour, depth, y, x] for {wanted[0]} colours and {wanted[1]} depths"
             raise InputError("energy", rule, f"shape {shape}", "Name every colour and depth of the array.")
-        if not all(depth > 0 for depth in self.depths_m):
+        if not 0 < number_of(self.pixel_m) < np.inf:
+            raise InputError("pixel_m", "must be a positive number of metres", repr(self.pixel_m), "For example 2e-6.")
+        if not all(number_of(depth) > 0 for depth in self.depths_m):
             raise InputError("depths_m", "must be positive, metres", str(self.depths_m), "For example (0.05, np.inf).")
 
     @property
@@ -94,10 +100,11 @@ class PsfBank(eqx.Module):
 
         `aimed` are numbers of what the DOE should draw (`sim.metrics.METRICS`).
 
-        A ValueError where the camera is not known.
+        An InputError where the camera is not known.
         """
         if self.camera is None:
-            raise ValueError("`bank.camera` must be known for metrics, but it is None; give it by `bank.with_camera`")
+            rule, cure = "`bank.camera` must be known for metrics", "Give it by bank.with_camera(camera)."
+            raise InputError("camera", rule, "None", cure)
         return MetricInputs(self.energy, self.depths_m, self.camera, near_m, doe, nominal, lens and lens.energy, aimed)
 
     def metric(self, name: str) -> Table:
@@ -114,6 +121,9 @@ class PsfBank(eqx.Module):
 
     def throughput(self) -> Table:
         """Energy in the window, `[colour, depth]`."""
+        if self.camera is None:
+            traced, sides = is_traced(self.energy), (-2, -1)
+            return jnp.sum(self.energy, sides) if traced else np.asarray(np.sum(self.energy, sides, np.float64))
         return self.metric("throughput")
 
     def far_spot(self) -> Table:
@@ -133,12 +143,16 @@ class PsfBank(eqx.Module):
         return encircled_energy(self.energy, self.pixel_m, radii_m)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
-        """Draw the PSFs, near depths (a defocus disc beyond the far spot) and far ones each on a scale of their own."""
-        from sim.plots.psfs import plot_psfs
+        """Draw the PSFs, near depths (a defocus disc beyond the far spot) and far ones each on a scale of their own.
 
-        camera = self.metric_inputs().camera
-        near, far = near_and_far(camera, self.depths_m)
-        return plot_psfs(self, camera, near, far, ax)
+        Without a camera, as PSFs that were measured, all have one scale, and no marks of a lens.
+        """
+        from sim.plots.psfs import plot_measured, plot_psfs
+
+        if self.camera is None:
+            return plot_measured(self, ax)
+        near, far = near_and_far(self.camera, self.depths_m)
+        return plot_psfs(self, self.camera, near, far, ax)
 
     def _repr_html_(self) -> str:
         """Table and picture for notebooks."""
@@ -152,10 +166,16 @@ class PsfBank(eqx.Module):
             "pixels": f"{x} x {y} of {size_text(self.in_angles, self.pixel_m)}",
         }
         if self.camera is None:
-            return html_of("PSFs", rows)
+            values = self.throughput()
+            rows["light in the window"] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
+            return html_of("PSFs", rows, self.plot())
         rows["lens"] = self.camera.lens_text
+        near, far = near_and_far(self.camera, self.depths_m)
         for name in ("throughput", "far_spot", "ring_to_disc"):
-            values = self.metric(name)
+            meant = {"near": near, "far": far, "all": self.depths_m}[METRICS[name].depths]
+            if not meant:
+                continue
+            values = np.asarray(self.metric(name))[:, [depth in meant for depth in self.depths_m]]
             rows[METRICS[name].label] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
         return html_of("PSFs", rows, self.plot())
 
@@ -256,7 +276,8 @@ def optic_of(optic: Any, camera: Camera | None = None, depths_m: Sequence[float]
             raise TypeError(f"`camera` must be left out for a {type(found).__name__}, which has its own")
         return found.with_camera(camera).prepared_for(depths_m)
     if camera is None:
-        raise ValueError(f"a height map needs a `camera`, but got {type(optic).__name__} alone")
+        rule, cure = "a height map needs a `camera`", "Give lens, sensor and substrate, a sim.Camera."
+        raise InputError("camera", rule, f"{type(optic).__name__} alone", cure)
     return optic_as_drawn(camera, optic, depths_m=depths_m)
 
 
@@ -310,7 +331,7 @@ def psf(
 
     Args:
         optic: an `Optic`, anything that carries one (a design, a DOE as fabricated, a bank), or a height map `[y, x]`
-            in metres on `camera.grid`.
+            in metres on `camera.grid`, also as a `fab.HeightMap` or a `fab.LevelMap`; None for the bare lens.
         camera: lens, sensor, substrate and DOE grid of a bare height map; another lens or sensor for an optic of cells.
         depths: one source depth or several, in metres or with a unit; "inf" for a star.
         field_rad: field angles (y, x), radians, positive where light travels toward +y or +x; the window follows the

@@ -88,7 +88,8 @@ class AreaTask:
                 raise InputError(where, rule, got, cure)
             own = seen.lines[0].wavelength_m
             turn = 1.0 if own == first else float(camera.waves_per_metre(own) / camera.waves_per_metre(first))
-            targets.append(AreaTarget.of(area, seen, files.get(f"{key}.picture"), files.get(f"{key}.phase")))
+            pictures = files.get(f"{key}.picture"), files.get(f"{key}.phase")
+            targets.append(AreaTarget.of(area, seen, *pictures, key=key))
             problems.append(AreaProblem.of(targets[-1], seen, turn))
         one_colour = all(problem.turn == 1 for problem in problems)
         span = None if one_colour else float(2 * np.pi * camera.waves_per_metre(first) * levels.period_m)

@@ -212,6 +212,12 @@ class AreaTable:
 
         return plot_area(self, ax)
 
+    def _repr_html_(self) -> str:
+        """Its line and its picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of("Light on the area", {"area": self.describe()}, self.plot())
+
 
 @dataclass(frozen=True)
 class AreaTables:
@@ -261,6 +267,14 @@ class AreaTables:
 
         return plot_areas(self.tables, ax)
 
+    def _repr_html_(self) -> str:
+        """Its line and its picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of(
+            "Light on the areas", {f"area {k}": one.describe() for k, one in enumerate(self.tables)}, self.plot()
+        )
+
 
 def areas_of_design(design: Design, doe: CellOptic) -> tuple[AreaTable, ...]:
     """Light on each of the areas of a design's spec, of the design as drawn or as fabricated."""
@@ -301,7 +315,8 @@ def targets_of_design(design: Design) -> tuple[AreaTarget, ...]:
         key = spec.area_key(index)
         picture = input_files(spec, f"{key}.picture")[f"{key}.picture"] if area.picture else None
         phase = input_files(spec, f"{key}.phase")[f"{key}.phase"] if area.phase_picture else None
-        targets.append(AreaTarget.of(area, camera_for(area, design.camera), picture, phase, samples=_SAMPLES))
+        camera = camera_for(area, design.camera)
+        targets.append(AreaTarget.of(area, camera, picture, phase, samples=_SAMPLES, key=key))
     return tuple(targets)
 
 

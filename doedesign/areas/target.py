@@ -108,8 +108,11 @@ class AreaTarget:
         phase: Path | None = None,
         *,
         samples: float = _SAMPLES,
+        key: str = "area",
     ) -> "AreaTarget":
         """The area of a spec for the first wavelength of a camera, so many samples per lambda d / D apart.
+
+        `key` is what messages call it, "area[1]" for the second of several.
 
         Raises:
             InputError: a picture that cannot be read, is dark, or reaches beyond what cells can light, a phase that is
@@ -129,10 +132,10 @@ class AreaTarget:
             if last - first > _MOST:
                 rule = f"at most {_MOST} times the smallest detail, over {samples:g}, across"
                 got, cure = f"{last - first:.0f}", "Choose a smaller area or aperture."
-                raise InputError("area", rule, got, cure)
+                raise InputError(key, rule, got, cure)
             axes.append(np.arange(first, last + 1) * step)
         moved = camera.moved_sines()
-        _require_reach(camera, max(float(np.abs(axis - by).max()) for axis, by in zip(axes, moved, strict=True)))
+        _require_reach(camera, max(float(np.abs(axis - by).max()) for axis, by in zip(axes, moved, strict=True)), key)
         y, x = camera.image_m(axes[0][:, None], axes[1][None, :])
         at = y - middle[0], x - middle[1]
         value = _draw(table, at, edge) if light is None else _draw_picture(light, at, size_m)
@@ -152,7 +155,7 @@ class AreaTarget:
             sizes = edge, _LEAST * edge, min(filter(None, (*size_m, band_m)))
             falls, least, got = (_size_text(camera, size) for size in sizes)
             rule = f"light falls over {falls} there, so that an area needs {least}"
-            raise InputError("area", rule, got, "Choose a larger area, a larger aperture, or a nearer sensor.")
+            raise InputError(key, rule, got, "Choose a larger area, a larger aperture, or a nearer sensor.")
         return target
 
 
@@ -180,13 +183,13 @@ def finest_detail_m(camera: Camera) -> float:
     return float(max(quality * scale / np.pi / radius, finest))
 
 
-def _require_reach(camera: Camera, farthest: float) -> None:
-    """Raise an `InputError` where the farthest direction sine is beyond those that the cells tell apart."""
+def _require_reach(camera: Camera, farthest: float, key: str) -> None:
+    """Raise an `InputError` where the farthest direction sine of an area is beyond those that the cells tell apart."""
     most = camera.lines[0].wavelength_m / (2 * camera.grid.pitch_m)
     if farthest > most:
         finer = format_length(float(f"{camera.grid.pitch_m * most / farthest:.3g}"))
         rule = f"cells of {format_length(camera.grid.pitch_m)} light directions up to a sine of {most:.3g}"
-        raise InputError("area", rule, f"{farthest:.3g}", f"Choose a smaller area, or a pitch of at most {finer}.")
+        raise InputError(key, rule, f"{farthest:.3g}", f"Choose a smaller area, or a pitch of at most {finer}.")
 
 
 def _draw(

@@ -1,6 +1,7 @@
 """Design: a DOE as it is drawn, with the camera it is for."""
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +17,8 @@ from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Process, Variation
-from fab.units import format_length, metres
-from sim.camera import Camera
+from fab.units import format_length, metres, number_of, require_kind
+from sim.camera import Camera, require_same_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,8 +38,8 @@ class Design:
     Attributes:
         level_map: level of every cell; heights follow from it.
         camera: lens, sensor and substrate, on the grid of the level map.
-        near_m: distances of obstructions, metres.
-        far_m: distances of the scene, metres; `inf` for a star.
+        near_m: distances of obstructions, metres; none by default.
+        far_m: distances of the scene, metres; `inf`, a star, by default.
         edge_moves_m: how far the masks draw the edges of etched areas outward to make up for the line-width bias of the
             process, first mask first, metres; empty for nowhere.
         aim: what the plate is to come out as, where the masks are drawn so that errors of the process lead there from
@@ -49,12 +50,16 @@ class Design:
         folder: its run folder, if it has one.
         area_targets: the areas of its spec with their pictures read, as `doedesign.areas.target.AreaTarget`, for
             processes that may not have the files; empty where they are read from these.
+
+    Raises:
+        InputError: something other than a level map, a camera or distances, or a camera on another grid than the level
+            map's.
     """
 
     level_map: LevelMap
     camera: Camera
-    near_m: tuple[float, ...]
-    far_m: tuple[float, ...]
+    near_m: tuple[float, ...] = ()
+    far_m: tuple[float, ...] = (math.inf,)
     edge_moves_m: tuple[float, ...] = ()
     aim: LevelMap | None = None
     continuous_m: Float[np.ndarray, "y x"] | None = None
@@ -62,6 +67,21 @@ class Design:
     history: tuple[Mapping[str, Any], ...] = ()
     folder: Path | None = None
     area_targets: tuple[Any, ...] = ()  # a module that builds on this one has the class
+
+    def __post_init__(self) -> None:
+        """Refuse what is no design, and a camera that is for another plate."""
+        cure = "Quantise heights: fab.LevelMap.from_height(fab.HeightMap(height_m, grid, aperture), levels)."
+        require_kind("level_map", self.level_map, LevelMap, cure)
+        require_kind("camera", self.camera, Camera, "Give lens, sensor and substrate, a sim.Camera.")
+        require_same_grid(self.camera, self.level_map.grid)
+        for name in ("near_m", "far_m"):
+            given: Any = getattr(self, name)
+            distances = tuple(given) if isinstance(given, tuple | list | np.ndarray) else (math.nan,)
+            if not all(number_of(distance) > 0 for distance in distances):
+                raise InputError(
+                    name, "must be several distances, positive metres", repr(given), "For example (0.05,)."
+                )
+            object.__setattr__(self, name, distances)
 
     @property
     def name(self) -> str:
@@ -138,6 +158,9 @@ class Design:
             raise InputError("seed", "a plate has one source of errors", "also `variation`", "Leave one of them out.")
         if isinstance(variation, Variation):
             return variation, "given errors"
+        if variation is not None and not isinstance(variation, str | Path):
+            rule, cure = "must be a fab.Variation or a TOML file", "For example fab.Variation(common_depth_scale=0.02)."
+            raise InputError("variation", rule, repr(variation), cure)
         if variation is not None:
             return load_variation(variation), f"errors of {Path(variation).name}"
         if not sources_of(process) and not any(spread.mean for spread in process.spreads.values()):

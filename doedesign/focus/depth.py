@@ -132,6 +132,12 @@ class FocusTable:
 
         return plot_focus(self, ax)
 
+    def _repr_html_(self) -> str:
+        """Its line and its picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of("Foci", {"foci": self.describe()}, self.plot())
+
 
 def focus_of_design(design: Design, doe: CellOptic) -> FocusTable:
     """Foci of a design's spec, of the design as drawn or as fabricated."""

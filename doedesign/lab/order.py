@@ -35,6 +35,7 @@ from fab.runsheet.tables import SILICA, SheetPrediction
 from fab.solids.patch import Patch
 from fab.units import metres
 from sim.material import material
+from sim.metrics import mean_wavelength_m
 
 log = logging.getLogger("doedesign")
 
@@ -98,7 +99,7 @@ def write_masks(
     if not isinstance(terms, OrderTerms):
         asked = spec.order if spec else OrderSpec()
         terms = terms_from_spec(asked if terms is None else load_order(terms))
-    made_of = SILICA if spec is None else material(spec.doe.material).title
+    made_of = SILICA if design is None else material(design.camera.material).title
     if made_of != SILICA:
         log.warning("the run sheet leaves cleaning, plasma and rates to the lab: its recipe is not for %s", made_of)
     order = plan_order(
@@ -125,9 +126,10 @@ def write_masks(
     certified = certified_orders(design and design.folder, order.level_map.digest)
 
     def predicted(order: Order) -> SheetPrediction | None:
-        if design is None or design.spec is None:
+        if design is None:
             return None
-        drawn, design_m = replace(design, level_map=order.level_map), design.spec.optics.design_wavelength_m
+        drawn = replace(design, level_map=order.level_map)
+        design_m = spec.optics.design_wavelength_m if spec else mean_wavelength_m(design.camera.colours[0])
         moves_m = [move * order.dbu_m for move in order.edge_moves()]
         try:
             seen = predict_sheet(drawn, order.process, design_m, probe_m, moves_m)

@@ -368,6 +368,17 @@ def finish_run(
     run.path(CHECKPOINT).unlink(missing_ok=True)
 
 
+def run_of(source: Run | str | Path) -> Run:
+    """Return a run, or open the finished one in a folder or of a design; an InputError else, and as `open_run`."""
+    if isinstance(source, Run):
+        return source
+    source = getattr(source, "folder", None) or source
+    if not isinstance(source, str | Path):
+        rule, cure = "must be a run or its folder", 'A design has one that was optimised with out="runs/NAME".'
+        raise InputError("run", rule, f"a {type(source).__name__}", cure)
+    return open_run(Path(source))
+
+
 def open_run(folder: Path) -> Run:
     """Open a finished run, or a finished or released training, whose DOE was trained beside its network.
 

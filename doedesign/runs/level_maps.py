@@ -101,6 +101,16 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
     return LevelMap.from_height(height, levels, run.spec.name, wrapped=True)
 
 
+def require_source(name: str, source: object) -> None:
+    """Raise an InputError for what is no design, run or path; a plate of one's own is made a design first."""
+    if not isinstance(source, Design | Run | str | Path):
+        rule, cure = (
+            "must be a design, a run or its folder",
+            "Of a level map and a camera: dd.Design(level_map, camera).",
+        )
+        raise InputError(name, rule, f"a {type(source).__name__}", cure)
+
+
 def open_design(
     source: "Design | Run | str | Path",
     masks: str | Path | Literal[False] | None = None,
@@ -121,10 +131,12 @@ def open_design(
         free: tables of the spec that may be changed; of the sensor, only its response to light.
 
     Raises:
-        InputError: a run or order that cannot be read, an order of another run, or an override of something else.
+        InputError: no design or run, a run or order that cannot be read, an order of another run, or an override of
+            something else.
     """
     if isinstance(source, Design):
         return source
+    require_source("design", source)
     run = source if isinstance(source, Run) else open_run(Path(source))
     level_map = level_map_of_run(run, levels)
     folder = Path(masks) if masks else None
@@ -190,6 +202,7 @@ def drawing_from(
     Raises:
         InputError: neither a run nor a readable height map, or the number or step of the levels is missing.
     """
+    require_source("source", source)
     if isinstance(source, str):
         source = Path(source)
     if isinstance(source, Path):

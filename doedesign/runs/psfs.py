@@ -13,7 +13,7 @@ import numpy as np
 from doedesign.build import camera_from_spec
 from doedesign.design.metrics import design_metrics
 from doedesign.runs.curve_tables import encircled_csv, mtf_csv
-from doedesign.runs.folder import CONTINUOUS, Run, open_run
+from doedesign.runs.folder import CONTINUOUS, Run, run_of
 from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
 from doedesign.runs.orders import own_order
 from doedesign.runs.results import results_folder
@@ -64,7 +64,7 @@ def psfs(
     """
     field_rad = field_from(field_rad)
     depths = depths_from(depths_m) if np.size(depths_m) else ()
-    run = run if isinstance(run, Run) else open_run(Path(run))
+    run = run_of(run)
     camera = camera_from_spec(run.spec)
     near, far = _near_and_far(run.spec, depths)
     designs = _heights_of(run, masks)

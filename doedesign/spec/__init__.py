@@ -98,6 +98,9 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
+    if not isinstance(path, str | Path):
+        rule, cure = "must be a spec or its TOML file", 'For example dd.load_spec("lens.toml", steps=60).'
+        raise InputError("spec", rule, f"a {type(path).__name__}", cure)
     path = Path(path)
     raw = read_toml(path, *_FILES[Spec])
     keys = [_override(raw, text) for text in ([overrides] if isinstance(overrides, str) else overrides)]
@@ -175,6 +178,11 @@ def _load(
     usual: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Table:
     """Read a file; with a `table`, pass over the other tables of a spec. `usual` stands for keys that are left out."""
+    if not isinstance(path, str | Path):
+        what, example = _FILES[model]
+        raise InputError(
+            table or "variation", f"must be {what} or its TOML file", repr(path), f"For example {example}."
+        )
     raw = read_toml(Path(path), *_FILES[model])
     raw |= {name: filled for name, filled in one_wafer(raw).items() if name in raw}
     others = {toml_key(name) for name in Spec.model_fields if table} - {table}

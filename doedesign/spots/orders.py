@@ -205,6 +205,12 @@ class OrderTable:
 
         return plot_orders(self, ax)
 
+    def _repr_html_(self) -> str:
+        """Its line and its picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of("Light of every spot", {"spots": self.describe()}, self.plot())
+
 
 @dataclass(frozen=True)
 class OrderTables:
@@ -249,6 +255,12 @@ class OrderTables:
         from doedesign.report.spots import plot_colours
 
         return plot_colours(self.tables, ax)
+
+    def _repr_html_(self) -> str:
+        """Its line and its picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of("Light of every spot", {one.colour: one.describe() for one in self.tables}, self.plot())
 
 
 def order_table(

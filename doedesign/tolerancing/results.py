@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -195,8 +196,8 @@ def tolerance(
     where: dict[str, Any] = {"out": out, "workers": workers, "scheduler": scheduler, "evaluate": evaluate}
     asked = study(design, **settings, **where)
     # All draws first: mistakes in the questions show before anything is computed, and no worker waits between two.
-    if draws < 1:
-        raise InputError("draws", "must be at least 1", draws, "For example 100.")
+    if not isinstance(draws, Integral) or isinstance(draws, bool) or draws < 1:
+        raise InputError("draws", "must be at least 1, a whole number", repr(draws), "For example 100.")
     keys = [NOMINAL, EXPECTED, *normal_keys(draws)]
     if sensitivity == "one_at_a_time":
         keys += one_at_a_time_keys(asked.process)

@@ -6,7 +6,7 @@ from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +41,7 @@ from fab.draws import (
 from fab.errors import InputError
 from fab.files import sha256_bytes
 from fab.process import DEVIATIONS, Process, Variation, error_names
+from fab.units import require_kind
 from sim.camera import Camera
 
 if TYPE_CHECKING:
@@ -267,6 +268,7 @@ def _with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
     """A process with some errors changed as in `study`."""
     from doedesign.spec import ErrorsSpec, process_from_json, validated
 
+    require_kind("errors", errors, Mapping, 'For example {"overlay_x": "0.5 um"}.')
     _require_units(errors)
     in_si = {name: value for name, value in errors.items() if name in DEVIATIONS and DEVIATIONS[name].unit != "1"}
     read = validated(ErrorsSpec, {name: value for name, value in errors.items() if name not in in_si}, "errors")
@@ -312,8 +314,8 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, in_mem
 
 
 def _at_least_one(name: str, value: int) -> int:
-    if value < 1:
-        raise InputError(name, "must be at least 1", value, "For example 2.")
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+        raise InputError(name, "must be at least 1, a whole number", repr(value), "For example 2.")
     return value
 
 

@@ -335,7 +335,7 @@ def read_manifest(folder: str | Path) -> Manifest:
                 str(path), "every file must be listed by its plain name", repr(name), "Write the order again."
             )
     etched = sorted(mask.bit for mask in manifest.masks)
-    if len(manifest.shape) != 2 or etched != list(range(Levels(manifest.levels, 1.0).bits)):
+    if len(manifest.shape) != 2 or etched != list(range(Levels(manifest.levels, NM).bits)):
         got = f"shape {manifest.shape} and {len(manifest.masks)} masks"
         raise InputError(str(path), "shape and masks must fit the levels", got, "Write the order again.")
     bits = range(len(manifest.masks))

@@ -26,7 +26,7 @@ from fab.rules.repair import Repair, repaired
 from fab.runsheet.tables import SILICA, Predictions
 from fab.solids.patch import Patch
 from fab.stock import STOCK, process_from
-from fab.units import NM, UM, format_length
+from fab.units import NM, UM, format_length, require_kind
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -257,6 +257,9 @@ def plan_order(
     if on_violation not in get_args(OnViolation):
         rule = f"must be one of {', '.join(get_args(OnViolation))}"
         raise InputError("on_violation", rule, repr(on_violation), "Choose one of these.")
+    require_kind("level_map", level_map, LevelMap, "A design has one: design.level_map.")
+    for name, value, kind in (("wafer", wafer, Wafer), ("chrome", chrome, Chrome), ("patch", patch, Patch)):
+        require_kind(name, value, kind if value is not None else type(None), f"Give a fab.{kind.__name__}.")
     made_by = process_from(process, level_map.levels)
     if made_by.reduction > 1 and not one_to_one:
         rule = "must print plates at 1:1 by contact, a whole wafer at a time, which is what is drawn"

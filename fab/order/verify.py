@@ -61,7 +61,11 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
         InputError: the folder is not a mask order, or its manifest is corrupt.
         CheckFailed: no level map is left to compare with; differences alone raise in `VerificationReport.require`.
     """
-    return verify_folder(Path(order) if isinstance(order, str | Path) else order.folder)
+    folder = order if isinstance(order, str | Path) else getattr(order, "folder", None)
+    if folder is None:
+        rule, cure = "must be a folder, or what write_order returned", 'For example "masks/lens".'
+        raise InputError("order", rule, f"a {type(order).__name__}", cure)
+    return verify_folder(Path(folder))
 
 
 class FilesRead(NamedTuple):

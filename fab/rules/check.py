@@ -35,7 +35,7 @@ from fab.process import Process
 from fab.rules import bitplanes as bits
 from fab.rules.widths import count_bounded, narrow_runs, shortest
 from fab.stock import process_from
-from fab.units import UM, format_length
+from fab.units import UM, format_length, require_kind
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -329,9 +329,7 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     Raises:
         InputError: no level map, a process of another staircase, or one of an unknown name.
     """
-    if not isinstance(level_map, LevelMap):
-        kind = type(level_map).__name__
-        raise InputError("level_map", "must be a LevelMap", f"a {kind}", "A design has one: design.level_map.")
+    require_kind("level_map", level_map, LevelMap, "A design has one: design.level_map.")
     levels = level_map.levels
     rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
     grid, relief = level_map.grid, level_map.relief

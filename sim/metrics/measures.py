@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
@@ -63,7 +64,14 @@ def encircled_energy(
     """Energy `[..., radius]` of `psfs` `[..., y, x]` of pitch `pixel_m` inside centred discs of `radii_m`, metres.
 
     Not divided by the total; partly covered pixels count by area.
+
+    Raises:
+        InputError: no radii, or radii that are not numbers of metres of 0 or more.
     """
+    given = np.asarray(radii_m)
+    if given.ndim != 1 or given.size == 0 or given.dtype.kind not in "fiu" or not np.all(given >= 0):
+        rule, cure = "must be several radii, numbers of metres of 0 or more", "For example [1e-6, 2e-6]."
+        raise InputError("radii_m", rule, repr(radii_m), cure)
     y, x = psfs.shape[-2:]
     discs = [disc_weights((y, x), pixel_m, float(radius)) for radius in radii_m]
     if is_traced(psfs):

@@ -7,13 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from fab.errors import InputError
 from sim.optic import CellOptic
 from sim.tracing import is_traced, stacked, total
 
 
-def mean_transmission(doe: CellOptic) -> Complex[np.ndarray, " w"] | Complex[Array, " w"]:
-    """Mean transmission c0 for `doe.wavelengths_m`, weighted by open shares of cells and the irradiance on them."""
-    return _mean_over_aperture(doe, doe.means)
+def mean_transmission(doe: Any) -> Complex[np.ndarray, " w"] | Complex[Array, " w"]:
+    """Mean transmission c0 for `doe.wavelengths_m`, weighted by open shares of cells and the irradiance on them.
+
+    `doe` is an optic of cells, or what carries one, such as a design; an InputError for anything else.
+    """
+    cells = _cells("doe", doe)
+    return _mean_over_aperture(cells, cells.means)
+
+
+def _cells(name: str, doe: Any) -> CellOptic:
+    """The optic of cells that something is or carries; an InputError for anything else, which has no transmission."""
+    found = doe.as_optic() if hasattr(doe, "as_optic") else doe
+    if not isinstance(found, CellOptic):
+        cure = "Give a design, a DOE as fabricated, or sim.HeightOptic.of(camera, height_m)."
+        raise InputError(name, "must be a DOE of cells", f"a {type(doe).__name__}", cure)
+    return found
 
 
 def _mean_over_aperture(doe: CellOptic, values: Any) -> Any:
@@ -40,16 +54,21 @@ def opening(doe: CellOptic, wavelength_m: float) -> Any:
     return total(doe.coverage if light is None else doe.coverage * light) / cells
 
 
-def zeroth_order(doe: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
-    """Fraction |c0|^2 of the light that passes as if the DOE were flat, for `doe.wavelengths_m`."""
+def zeroth_order(doe: Any) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
+    """Fraction |c0|^2 of the light that passes as if the DOE were flat, for `doe.wavelengths_m`.
+
+    `doe` is as in `mean_transmission`.
+    """
     return abs(mean_transmission(doe)) ** 2
 
 
-def strehl(doe: CellOptic, nominal: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
+def strehl(doe: Any, nominal: Any) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
     """Overlap |<t conj(t_nominal)>|^2 with the field of the DOE exactly as drawn, for `doe.wavelengths_m`.
 
-    The cells of `doe` and those of `nominal` may be parts of those that were drawn.
+    Each is an optic of cells, or what carries one, such as a design; an InputError for anything else. The cells of
+    `doe` and those of `nominal` may be parts of those that were drawn.
     """
+    doe, nominal = _cells("doe", doe), _cells("nominal", nominal)
     (ny, nx), other = doe.camera.grid.shape, nominal.camera.grid.shape[0]
     xp, common = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np, math.lcm(ny, other)
     meant = in_parts(xp.conj(xp.asarray(nominal.means)), common // other)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.figure import DPI, INK, LIGHT, SMALL, bare, evenly_spaced, extent_of, length_text, panels, shrunk
+from fab.units import DEGREES, MICROMETRES
 from sim.camera import Camera
 from sim.metrics import energy_within, mean_wavelength_m, spot_radius_m
 from sim.plots.colours import colour_label, depth_positions, wavelength_order
@@ -99,6 +100,44 @@ def plot_psfs(
             label_places(axes, unit_of(camera), "y")
             axes.set_ylabel(f"{name}\n{axes.get_ylabel()}")
         grid[0, 0].locator_params(nbins=3, steps=[1, 2, 5, 10])
+    return figure
+
+
+def plot_measured(bank: "Bank", ax: "Axes | None" = None) -> "FigureBase":
+    """Draw PSFs whose camera is not known, such as measured ones: a row per colour, a column per depth, one scale.
+
+    Of more than six of either an even choice is shown.
+    """
+    depths = evenly_spaced(len(bank.depths_m), _MOST_COLUMNS)
+    rows = evenly_spaced(len(bank.colours), _MOST_ROWS)
+    unit = DEGREES if bank.in_angles else MICROMETRES
+    side = min(max(10.0 / len(depths), 1.6), 3.2)
+    chosen = np.asarray(bank.energy)[rows][:, depths]
+    images = np.stack([[shrunk(image, round(DPI * side)) for image in row] for row in chosen])
+    norm = light_scale(images, float(chosen.max()))
+    size = (max(0.9 + len(depths) * (side + 0.1), 4.5), 1.65 + len(rows) * (side + 0.1))
+    note = "the camera is not known: no far spot and no defocus disc; colours: logarithmic, one scale"
+    with panels(ax, size, "Point spread functions", note, layout="compressed") as figure:
+        grid = figure.subplots(len(rows), len(depths), sharex=True, sharey=True, squeeze=False)
+        for row, colour in enumerate(rows):
+            for column, depth in enumerate(depths):
+                axes = grid[row, column]
+                box = extent_of(chosen.shape[-2:], bank.pixel_m / unit.scale, 1.0)
+                axes.imshow(
+                    images[row, column], origin="lower", extent=box, norm=norm, cmap=LIGHT, interpolation="auto"
+                )
+                if row == 0:
+                    axes.set_title(length_text(bank.depths_m[depth]))
+            label_places(grid[row, 0], unit, "y")
+            grid[row, 0].set_ylabel(f"{bank.colours[colour]}\n{grid[row, 0].get_ylabel()}")
+        for axes in grid[-1]:
+            label_places(axes, unit, "x")
+        grid[0, 0].locator_params(nbins=3, steps=[1, 2, 5, 10])
+        bar = figure.colorbar(
+            grid[0, 0].images[0], ax=grid.ravel().tolist(), location="bottom", aspect=20 * len(depths)
+        )
+        bar.set_label("light per pixel")
+        bar.ax.minorticks_off()
     return figure
 
 

@@ -129,8 +129,8 @@ def with_edges(
     """A DOE of upright walls, with their light.
 
     Args:
-        height_m: `[y, x]` height of every cell of `camera.grid`, metres; numpy, or jax. Traced heights must not differ
-            by more than two waves from one cell to the next.
+        height_m: `[y, x]` height of every cell of `camera.grid`, metres; numpy, or jax, or a map of `fab`. Traced
+            heights must not differ by more than two waves from one cell to the next.
         camera: DOE grid, aperture, substrate, lens and sensor, and the polarisation of the light.
         depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between.
         wavelengths_m: vacuum wavelengths; those of the camera's lines by default.

@@ -5,7 +5,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,11 +14,13 @@ from jaxtyping import Array, Complex, Float, UInt8
 
 from fab.grid import Grid
 from fab.layout.polygons import run_lengths
+from fab.level_map import LevelMap
 from fab.levels import height_of, planes
 from fab.process import MaskDisc, Process, Variation
+from fab.units import require_kind
 from sim.aperture import circle_coverage, displaced_cells, open_cells, outline_of
 from sim.camera import Camera, SpectralLine
-from sim.metrics import in_parts
+from sim.metrics import in_parts, zeroth_order
 from sim.optic import ViewedOptic, height_transmission
 from sim.propagation.pupil import DoeRows, SourceColumns
 from sim.rigorous.edge_optic import EdgeOptic, with_edges
@@ -32,6 +34,10 @@ from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import CellMaps, transmission_of
 from sim.threads import at_once
 from sim.tracing import is_traced, single, stacked
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 
 class FabricatedDoe(ViewedOptic):
@@ -85,6 +91,31 @@ class FabricatedDoe(ViewedOptic):
         rows, columns = super().rows(line, source)
         return (rows if self.height_m is not None else rows._replace(coverage=None)), columns
 
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw its phase error, and the phase of its middle as drawn and as fabricated (`sim.plots.plate`)."""
+        from sim.plots.plate import plot_plate
+
+        return plot_plate(self, ax)
+
+    def _repr_html_(self) -> str:
+        """Table and picture for notebooks."""
+        from fab.figure import aperture_text, html_of, length_text
+
+        ny, nx = self.grid.shape
+        orders = zeroth_order(self)
+        rows = {
+            "cells": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
+            "clear aperture": aperture_text(self.camera.opening),
+            "substrate": self.camera.material,
+            "light": self.camera.light,
+            "errors": "none, as drawn" if self.height_m is not None else "as fabricated",
+            **{
+                f"0th order at {length_text(w)}": f"{100 * n:.3g} %"
+                for w, n in zip(self.wavelengths_m, orders, strict=True)
+            },
+        }
+        return html_of("DOE as fabricated", rows, self.plot())
+
     def with_camera(self, camera: Camera) -> "FabricatedDoe":
         """The same DOE before another lens or sensor; where that sees more oblique light than its own, less exact.
 
@@ -101,7 +132,7 @@ class FabricatedDoe(ViewedOptic):
 
 
 def as_fabricated(
-    level_map: UInt8[np.ndarray, "y x"],
+    level_map: LevelMap | UInt8[np.ndarray, "y x"],
     camera: Camera,
     process: Process,
     variation: Variation,
@@ -113,7 +144,8 @@ def as_fabricated(
     """Predict the plate that the masks of a level map and a process with given errors make.
 
     Args:
-        level_map: `[y, x]` level numbers, the top level where the glass stays blank (`fab.level_map.LevelMap.level`).
+        level_map: the DOE, or its `[y, x]` level numbers, the top level where the glass stays blank
+            (`fab.level_map.LevelMap.level`).
         camera: DOE grid, clear aperture and material; lens and sensor say how oblique the light is that matters.
         process: depths of the etches and where on the wafer the DOE lies.
         variation: the errors; `Variation()` gives the nominal plate, bit for bit but with `whole_cells` and edges.
@@ -128,11 +160,15 @@ def as_fabricated(
         the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.
 
     Raises:
-        InputError: an error is not finite, an edge moves by more than half a cell through line-width bias, corners are
-            rounded by more than half a cell, a mask is shifted by more than 8 cells, or an error has the wrong number
-            of masks.
+        InputError: an argument of another kind, an error is not a finite number, an edge moves by more than half a cell
+            through line-width bias, corners are rounded by more than half a cell, a mask is shifted by more than 8
+            cells, or an error has the wrong number of masks.
         ValueError: a level map of another shape than the grid.
     """
+    level_map = level_map.level if isinstance(level_map, LevelMap) else level_map
+    require_kind("camera", camera, Camera, "A design has one: design.camera.")
+    require_kind("process", process, Process, 'For example fab.process_from("contact_aligner", levels).')
+    require_kind("variation", variation, Variation, "For example fab.Variation(common_depth_scale=0.02).")
     if level_map.shape != camera.grid.shape:
         raise ValueError(f"`level_map` must have the grid's shape {camera.grid.shape}, but got {level_map.shape}")
     levels = process.levels

@@ -222,9 +222,24 @@ def relief_of(
     )
 
 
+def _require_numbers(variation: Variation, masks: int) -> None:
+    """Raise an InputError for errors that are no numbers, or one number where every mask has its own."""
+    for name, deviation in DEVIATIONS.items():
+        value = getattr(variation, name)
+        if deviation.per_mask and not isinstance(value, tuple):
+            example = ", ".join(["1e-6" if deviation.unit == "m" else "1e-3", *["0.0"] * (masks - 1)])
+            cure = f"For example ({example},)." if masks == 1 else f"For example ({example})."
+            raise InputError(f"variation.{name}", f"must have one value per mask, {masks}", repr(value), cure)
+        for one in value if deviation.per_mask else [value]:
+            if isinstance(one, str) or np.ndim(one) or np.asarray(one).dtype.kind not in "fiu":
+                unit = {"m": "metres", "rad": "radians", "1": "a share, 0.03 for 3 %"}[deviation.unit]
+                raise InputError(f"variation.{name}", f"must be a number, {unit}", repr(one), "Give SI units.")
+
+
 def require_possible(grid: Grid, process: Process, variation: Variation) -> None:
     """Refuse errors that the model does not describe."""
     pitch_m, masks = grid.pitch_m, process.masks
+    _require_numbers(variation, masks)
     for name in [f.name for f in fields(Variation) if f.name not in SETTINGS] + ["repeats"]:
         value = getattr(variation, name)
         if isinstance(value, tuple) and value and len(value) != masks:

@@ -856,6 +856,13 @@ def test_areas_that_cannot_be_are_named_by_their_number(tmp_path: Path, areas: l
     assert words in str(refused.value)
 
 
+def test_an_area_that_is_too_small_is_named_by_its_number(tmp_path: Path):
+    """What only the target finds said "area", whichever of several it was."""
+    spec = several(tmp_path, ["", 'edge = "100 um"'])
+    with pytest.raises(InputError, match=r"area\[1\]: light falls over 100 um there, so that an area needs 150 um"):
+        AreaTask.from_spec(spec)
+
+
 @pytest.mark.parametrize(
     ("changes", "where", "words"),
     [

@@ -110,11 +110,14 @@ def test_the_nearest_level_is_the_nearest(levels: Levels, seed: int):
 
 def test_halfway_goes_up_and_the_top_catches_half_a_step():
     # Sums of these are exact: 0, 2, 5, 7 and halves.
-    levels = Levels(4, 1.0, (2.0, 5.0))
-    heights = np.array([[0.0, 0.999, 1.0, 3.499, 3.5, 5.999, 6.0, 7.5]])
+    unit = 2.0**-20
+    levels = Levels(4, unit, (2 * unit, 5 * unit))
+    heights = unit * np.array([[0.0, 0.999, 1.0, 3.499, 3.5, 5.999, 6.0, 7.5]])
     assert quantise(heights, levels).tolist() == [[0, 0, 1, 1, 2, 2, 3, 3]]
-    with pytest.raises(InputError, match=r"half a step above the top level .*4 levels by etches of 2 m and 5 m"):
-        quantise(np.array([[7.6]]), levels)
+    with pytest.raises(
+        InputError, match=r"half a step above the top level .*4 levels by etches of 1\.9\d* um and 4\.7\d* um"
+    ):
+        quantise(unit * np.array([[7.6]]), levels)
 
 
 def test_the_wave_begins_within_the_share_of_one_level():

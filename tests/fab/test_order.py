@@ -245,9 +245,9 @@ def test_the_blank_fits_the_coordinates(level_map):
 @pytest.mark.parametrize("length_m", [1e300, math.inf, math.nan, 0.0, -1e-7])
 def test_lengths_that_no_drawing_has_are_refused(length_m):
     """Before anything is computed with them: their squares and sums are no numbers."""
-    with pytest.raises(InputError, match="level step: must be positive and at most 1 km"):
+    with pytest.raises(InputError, match="level step: must be positive and at most 1 mm, in metres"):
         Levels(4, length_m)
-    with pytest.raises(InputError, match="etch depths: must be positive and at most 1 km"):
+    with pytest.raises(InputError, match="etch depths: must be positive and at most 1 mm, in metres"):
         Levels(4, 1e-7, (1e-7, length_m))
     for pitch_m in (length_m, 1e-300):
         with pytest.raises(InputError, match="grid: pitch: must be positive, from"):
