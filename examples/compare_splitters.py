@@ -6,7 +6,8 @@ One beam becomes nine in a row, by unit cells of 1024 um, and five by five, by u
 smaller a cell, the more it suffers from masks that lie apart. Three lasers of different colours become three by three
 each on one plate of 32 levels; their worst colour counts. `spots.uniformity_as_fabricated` is the only difference
 between two designs. Plates are then drawn from every process, the first of which is the one that the designs know, with
-errors that no design has seen, and judged by the whole model of the process (`sim.surface`). Forty minutes for 400 plates each.
+errors that no design has seen, and judged by the whole model of the process (`sim.surface`). Forty minutes for
+400 plates each.
 """
 
 import argparse
