@@ -136,6 +136,7 @@ class Process:
                 raise InputError(
                     f"process: {name}", "must be finite and not negative", getattr(self, name), "Give 0 or more."
                 )
+            object.__setattr__(self, name, float(getattr(self, name)))  # rules of an order are told as they are kept
         if self.reduction < 1:
             raise InputError("process: reduction", "must be 1 or more", self.reduction, "For example 5.")
         if not math.hypot(*self.die_m) <= self.wafer_radius_m:
