@@ -283,6 +283,6 @@ def test_whole_numbers_stand_for_lengths_and_shares_too(tmp_path, levels):
 
 
 def test_a_value_of_another_kind_is_named_before_anything_is_drawn(tmp_path, level_map):
-    with pytest.raises(InputError, match="^wafer: zero_layer: .* but got 'maybe'"):
+    with pytest.raises(InputError, match=r"^wafer: zero_layer: .* but got 'maybe'"):
         write_order(tmp_path / "odd", level_map, wafer=replace(FEW, zero_layer="maybe"))
     assert not any(tmp_path.iterdir())
