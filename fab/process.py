@@ -136,6 +136,7 @@ class Process:
             if not 0 <= number_of(getattr(self, name)) < math.inf:
                 rule, cure = "must be finite and not negative, in metres", "Give 0 or more, such as 1e-6."
                 raise InputError(f"process: {name}", rule, repr(getattr(self, name)), cure)
+            object.__setattr__(self, name, float(getattr(self, name)))  # rules of an order are told as they are kept
         if self.reduction < 1:
             raise InputError("process: reduction", "must be 1 or more", self.reduction, "For example 5.")
         if not math.hypot(*self.die_m) <= self.wafer_radius_m:

@@ -55,8 +55,9 @@ _NOT_FOUND, _NONE_SELECTED = (
     5,
 )  # pytest's exit codes where a file breaks on import, and where all tests are slow ones
 _QUICK_S, _FILES_S = 60.0, 120.0  # of tests by themselves, and of all tests of files, that a mutant meets
-_COPIED = ("doedesign", "fab", "sim", "tests", "bench", "examples", "masks", "pyproject.toml", "README.md")
-_COPIED += ("CONTRIBUTING.md", "Makefile", "constraints.txt")
+COPIED = ("doedesign", "fab", "sim", "tests", "bench", "examples", "masks", "pyproject.toml", "README.md")
+COPIED += ("docs", "mkdocs.yml", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile")
+COPIED += ("constraints.txt", ".ci", ".gitignore")
 
 
 class Change(NamedTuple):
@@ -265,7 +266,7 @@ def _kill(tree: Path, tests: Sequence[str]) -> bool:
 def _copy(tree: Path) -> Path:
     """Copy the project."""
     tree.mkdir()
-    for name in _COPIED:
+    for name in COPIED:
         source = ROOT / name
         (shutil.copytree if source.is_dir() else shutil.copy2)(source, tree / name)
     return tree

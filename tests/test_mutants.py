@@ -1,8 +1,11 @@
 """Mutants: what is changed, which tests are meant for a file, and the list of those that harm nothing."""
 
+import subprocess
 import tomllib
 
-from tests.mutants import HARMLESS, ROOT, Coverage, chosen, mutant_of, places
+import pytest
+
+from tests.mutants import COPIED, HARMLESS, ROOT, Coverage, chosen, mutant_of, places
 from tests.mutants import tests_for as meant_for
 
 
@@ -43,3 +46,10 @@ def test_what_is_harmless_is_still_there_and_says_why():
         assert mutant["was"] in lines, mutant
         assert mutant["was"] != mutant["now"]
         assert len(mutant["why"]) > 20
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="git knows what belongs to the project")
+def test_the_whole_project_is_copied():
+    """Tests of its pages and of its release need more than the code."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+    assert {path.split("/")[0] for path in listed.stdout.decode().split("\0") if path} == set(COPIED)

@@ -48,6 +48,7 @@ class OrderSpec(SpecTable, frozen=True):
         defects_per_cm2: defects per cm² that are accepted.
         pellicle: kind of the pellicle, or "none".
         remarks: anything else.
+        sizing: whether the mask shop moves edges of the data; by default it does not.
     """
 
     revision: Revision = optional("A")
@@ -68,6 +69,7 @@ class OrderSpec(SpecTable, frozen=True):
     defects_per_cm2: NotNegative | None = optional(example="0.1")
     pellicle: Text | None = optional(example='"none"')
     remarks: Text | None = optional(example='"send in one box"')
+    sizing: Text | None = optional(example='"0.1 um inward, all edges"')
 
 
 class OrderFile(SpecTable, frozen=True):

@@ -21,7 +21,7 @@ from fab.units import MM, NM, UM
 Values = dict[str, Any]
 
 # Keys that every mask of an order shares, in the order of the form, with the words of the page. None in a record is a
-# blank.
+# blank; forms of earlier orders say nothing of sizing.
 SHARED: Mapping[str, str] = {
     "revision": "revision",
     "company": "company",
@@ -36,6 +36,7 @@ SHARED: Mapping[str, str] = {
     "chrome": "chrome",
     "orientation": "orientation",
     "scale": "scale of the data",
+    "sizing": "sizing of the data by the mask shop",
     "data_grid_nm": "grid of the data (nm)",
     "address_grid_nm": "address grid of the writer (nm)",
     "cd_tolerance_nm": "tolerance of line widths (nm, plus or minus)",
@@ -66,7 +67,7 @@ def _shared(order: Order) -> Values:
         return None if length_m is None else round(length_m / unit_m, 9)
 
     return {
-        **{key: getattr(terms, key, None) for key in SHARED},
+        **{key: getattr(terms, key, None) for key in SHARED if key != "sizing" or terms.sizing},
         "plate_size_mm": in_units(order.wafer.blank_m, MM),
         "plate_thickness_mm": in_units(terms.blank_thickness_m, MM),
         "plate_flatness_um": in_units(terms.blank_flatness_m, UM),
@@ -135,4 +136,5 @@ def form_csv(record: Values) -> bytes:
 
 def form_page(record: Values, csv_name: str) -> bytes:
     """Return a form as a page to print, which tells the reader the name of the CSV."""
-    return html_page("order.html", form=record, words=SHARED, csv_name=csv_name)
+    words = {key: text for key, text in SHARED.items() if key in record["shared"]}
+    return html_page("order.html", form=record, words=words, csv_name=csv_name)

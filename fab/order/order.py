@@ -19,7 +19,7 @@ from fab.layout.split import DieSplit, splits_of
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.order.formats import Formats
-from fab.order.terms import OrderTerms
+from fab.order.terms import UNSIZED, OrderTerms
 from fab.process import Process
 from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair import Repair, repaired
@@ -270,6 +270,7 @@ def plan_order(
         )
         raise InputError("process", rule, got, cure)
     wafer, terms = wafer or Wafer(), terms or OrderTerms()
+    terms = terms if terms.sizing else replace(terms, sizing=UNSIZED)
     report = check(level_map, Rules.from_process(made_by, terms.address_grid_m))
     inside = level_map.level[level_map.relief.inside(level_map.grid)]
     if inside.size and inside.min() == inside.max():

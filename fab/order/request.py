@@ -5,7 +5,7 @@ what was drawn at first.
 """
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -48,6 +48,25 @@ def request_of(order: Order) -> dict[str, Any]:
     drawn = {"name": level_map.name, "shape": list(level_map.shape), "pitch_m": level_map.grid.pitch_m}
     asked = _without_defaults(order, {name: _plain(getattr(order, name)) for name in _ASKED})
     return {"level_map": {**drawn, "aperture_m": level_map.relief.record()}, **asked}
+
+
+def as_recorded(order: Order) -> Order:
+    """Return an order whose values are of the kinds that its request gives back, 0.0 m where 0 m was asked for.
+
+    Raises:
+        InputError: a value of another kind than its field's.
+    """
+    hints, asked = get_type_hints(Order), {}
+    for name in _ASKED:
+        if name == "light":  # predicted, not asked for
+            continue
+        try:
+            asked[name] = TypeAdapter(hints[name]).validate_python(_plain(getattr(order, name)))
+        except ValidationError as errors:
+            found = errors.errors(include_url=False)[0]
+            where = ": ".join(map(str, (name, *found["loc"])))
+            raise InputError(where, found["msg"], repr(found["input"])[:60], "Give a value of its kind.") from errors
+    return replace(order, **asked)
 
 
 def order_from(request: Mapping[str, Any], level: NDArray[np.uint8], where: str) -> Order:

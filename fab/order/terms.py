@@ -1,14 +1,17 @@
 """Terms of a mask order: everything asked of a mask shop besides the drawing."""
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from numbers import Integral
 
 from fab.errors import InputError
+from fab.files import IF_ANY
 from fab.units import format_length
 
 _REVISION = re.compile(r"[A-Z0-9]{1,3}")
 _LONGEST_TEXT = 200
+# Moves of edges against what a process does are drawn, and twice would be once too often.
+UNSIZED = "none: lines on the plate as wide as in the data"
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,7 @@ class OrderTerms:
         defects_per_cm2: how many of them are accepted.
         pellicle: its kind, or "none".
         remarks: anything else.
+        sizing: whether the mask shop moves edges of the data; None in orders whose form does not say.
 
     Raises:
         InputError: an impossible value, named by its attribute.
@@ -57,14 +61,15 @@ class OrderTerms:
     defects_per_cm2: float | None = None
     pellicle: str | None = None
     remarks: str | None = None
+    sizing: str | None = field(default=None, metadata=IF_ANY)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, where = getattr(self, field.name), f"order: {field.name}"
+        for one in fields(self):
+            value, where = getattr(self, one.name), f"order: {one.name}"
             if isinstance(value, str) and not (value.isprintable() and 0 < len(value.strip()) <= _LONGEST_TEXT):
                 rule = f"must be one line of 1 to {_LONGEST_TEXT} characters"
                 raise InputError(where, rule, repr(value)[:60], "Shorten it, or leave it out.")
-            if field.name.endswith("_m") and isinstance(value, int | float) and not 0 < value < 0.1:
+            if one.name.endswith("_m") and isinstance(value, int | float) and not 0 < value < 0.1:
                 raise InputError(where, "must be positive and below 100 mm", format_length(value), "Check its unit.")
         if not _REVISION.fullmatch(self.revision):
             rule = "must be one to three capitals A-Z or digits"

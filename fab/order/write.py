@@ -36,6 +36,7 @@ from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
 from fab.order.formats import Formats
 from fab.order.order import Light, OnViolation, Order, plan_order
 from fab.order.papers import papers, pictures
+from fab.order.request import as_recorded
 from fab.order.terms import OrderTerms
 from fab.order.verify import FilesRead, read_files, verify_folder
 from fab.process import Process
@@ -219,7 +220,7 @@ def write_planned(folder: str | Path, order: Order, *, predict: Predict = lambda
 
     The light that its run sheet speaks of comes from `predict`.
     """
-    folder = Path(folder)
+    folder, order = Path(folder), as_recorded(order)
     _require_own(folder)
     with atomic_folder(folder) as fresh:
         manifest, found = _write_files(fresh, order, predict)

@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 from fab.layout.marks import alignment_notes
 from fab.layout.part import Photomask
+from fab.layout.structures import codes_by_depth
 from fab.levels import Levels
 from fab.process import Normal, Process
 from fab.runsheet.tables import SILICA, RunSheet
@@ -56,12 +57,12 @@ class Step(NamedTuple):
 def depths_m(levels: Levels, etches_m: Sequence[float] = ()) -> tuple[float, ...]:
     """Return the depths below the blank glass that all etches make together, blank glass first, metres.
 
-    `etches_m` are the depths of the etches, first mask first; those of the levels by default.
+    `etches_m` are the depths of the etches, first mask first; those of the levels by default. They come as the steps of
+    the staircase do that is scanned, by what is asked for, even where an etch misses that by more than a step.
     """
+    codes = (code for code in codes_by_depth(levels, range(levels.bits)) if code < levels.count)
     etches_m = etches_m or levels.depths_m
-    return tuple(
-        sorted(sum(depth for bit, depth in enumerate(etches_m) if code >> bit & 1) for code in range(levels.count))
-    )
+    return tuple(sum(depth for bit, depth in enumerate(etches_m) if code >> bit & 1) for code in codes)
 
 
 def expected_m(photomask: Photomask, process: Process) -> float:

@@ -29,6 +29,8 @@ from fab.solids.model import DoeModel, ModelKind, model_entry
 from fab.units import NM, UM
 
 _FIELD = 64
+# A comment, which every version of DXF may have; a header variable of units came later than the version written here.
+_DXF_UNIT = b"999\nunit of all lengths: 1 micrometre\n"
 
 
 def _layer_name(level: int, levels: Levels) -> str:
@@ -77,6 +79,8 @@ def _write(path: Path, model: DoeModel) -> None:
         _layout(model.level_map).write(str(path), options)
     except RuntimeError as error:
         raise InputError(str(path), "the file must be writable", str(error), "Check the disk.") from error
+    if options.format == "DXF":
+        path.write_bytes(_DXF_UNIT + path.read_bytes())
 
 
 def _problems(path: Path, entry: ModelEntry, model: DoeModel) -> list[str]:

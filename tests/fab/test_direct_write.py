@@ -45,6 +45,11 @@ def test_every_level_is_a_layer_of_merged_polygons(folder, ending):
         assert region.count() < 200
 
 
+def test_the_drawing_says_its_unit(folder):
+    begun = named(folder, "DIRECT.dxf").read_text().splitlines()[:4]
+    assert begun == ["999", "unit of all lengths: 1 micrometre", "0", "SECTION"]
+
+
 def test_the_dose_is_for_the_lab_to_fill_in(folder):
     rows = list(csv.DictReader(io.StringIO(named(folder, "DOSE.csv").read_text())))
     assert [(row["level"], row["layer"], float(row["height_nm"]), float(row["depth_nm"])) for row in rows] == [

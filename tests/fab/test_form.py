@@ -3,7 +3,8 @@
 import csv
 import io
 import re
-from dataclasses import asdict
+from collections import defaultdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import klayout.db as kdb
@@ -13,8 +14,12 @@ import pytest
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_file
 from fab.manifest.records import read_manifest
-from fab.order.form import SHARED, form_csv
+from fab.order.drawing import draw
+from fab.order.form import SHARED, form_csv, form_page, form_record
+from fab.order.order import plan_order
+from fab.order.request import request_of
 from fab.order.terms import OrderTerms
+from tests.fab.maps import FEW
 from tests.orders import named
 
 
@@ -95,3 +100,19 @@ def test_impossible_terms_are_refused(terms, where):
 def test_a_quantity_of_numpy_goes_into_json():
     copies: Any = np.int64(2)
     assert canonical_json(asdict(OrderTerms(quantity=copies))) == canonical_json(asdict(OrderTerms(quantity=2)))
+
+
+def test_the_form_says_that_the_mask_shop_moves_no_edges_or_how_far(written_order, rows, level_map):
+    assert {row["sizing"] for row in rows} == {"none: lines on the plate as wide as in the data"}
+    assert "sizing of the data by the mask shop" in named(written_order, "ORDER.html").read_text()
+    order = plan_order(level_map, terms=OrderTerms(sizing="0.1 um inward"))
+    assert order.terms.sizing == "0.1 um inward"
+
+
+def test_the_form_of_an_order_that_said_nothing_of_sizing_stays_as_it_is(level_map):
+    earlier = draw(replace(plan_order(level_map, wafer=FEW), terms=OrderTerms()))
+    assert "sizing" not in request_of(earlier.order)["terms"]
+    record = form_record(earlier, defaultdict(str))
+    assert "sizing" not in record["shared"]
+    assert b"sizing" not in form_csv(record)
+    assert b"sizing of the data" not in form_page(record, "FORM.csv")

@@ -17,8 +17,10 @@ from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.order import plain_name, plan_order
 from fab.order.terms import OrderTerms
+from fab.order.verify import verify
 from fab.order.write import write_order
-from fab.process import Process
+from fab.process import Normal, Process
+from fab.solids.patch import Patch
 from fab.units import UM
 from fab.verification.files import read_drawn_levels
 from tests.fab.maps import FEW, PLAIN, SMALL, level_map_from, wide_map
@@ -264,3 +266,23 @@ def test_what_to_do_about_broken_rules_is_one_of_three_words(level_map, word):
 def test_a_name_of_which_nothing_is_left_is_refused():
     with pytest.raises(InputError, match="mask order name"):
         plain_name("***")
+
+
+def test_whole_numbers_stand_for_lengths_and_shares_too(tmp_path, levels):
+    level_map = wide_map(np.indices((40, 40)).sum(axis=0) % 16, levels, Grid((40, 40), 4e-6))
+    asked = {
+        "process": Process(levels, spreads={"common_depth_scale": Normal(0, 1)}, minimum_line_m=0, die_m=(0, 0)),
+        "wafer": Wafer(dies=(1, 1), lane_m=0, edge_moves_m=(0,) * levels.bits),
+        "chrome": Chrome(overlap_m=0),
+        "patch": Patch(0, 0, 2e-5),
+        "terms": OrderTerms(defects_per_cm2=0),
+    }
+    order = write_order(tmp_path / "whole", level_map, **asked)
+    assert order.manifest.request["terms"]["defects_per_cm2"] == 0
+    assert verify(order.folder).passed
+
+
+def test_a_value_of_another_kind_is_named_before_anything_is_drawn(tmp_path, level_map):
+    with pytest.raises(InputError, match=r"^wafer: zero_layer: .* but got 'maybe'"):
+        write_order(tmp_path / "odd", level_map, wafer=replace(FEW, zero_layer="maybe"))
+    assert not any(tmp_path.iterdir())

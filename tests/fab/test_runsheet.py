@@ -328,3 +328,16 @@ def test_a_sheet_without_its_files_or_in_another_order_is_refused():
         replace(made, files={})
     with pytest.raises(InputError, match="order of the process"):
         replace(made, photomasks=other.photomasks)
+
+
+def test_the_depths_of_the_staircase_come_as_it_is_scanned():
+    """Also where an etch is expected to miss its target by more than a step."""
+    short = sheet(spreads={"depth_scale[3]": Normal(-0.25)})
+    content = record(short)
+    assert content["staircase_nm"][6:10] == pytest.approx([450, 525, 450, 525])
+    assert content["steps"][-2]["etch"]["deepest_floor_nm"] == pytest.approx(max(content["staircase_nm"]))
+    six = record(sheet(Levels(6, 200e-9), spreads={"depth_scale[2]": Normal(-0.5)}))
+    assert six["staircase_nm"] == pytest.approx([0, 200, 400, 600, 400, 600])
+    lag = record(sheet(Levels(5, 200e-9), spreads={"depth_scale[2]": Normal(-0.5)}))
+    assert lag["staircase_nm"] == pytest.approx([0, 200, 400, 600, 400])
+    assert "deepest floor 600 nm below" in run_sheet_page(lag, "a.json").decode()
