@@ -94,7 +94,7 @@ def aperture_parts(optic: CellOptic, depth_m: float, across: int) -> AperturePar
         (slice(y0, y1), slice(x0, x1))
         for y0, y1 in zip(cuts[0], cuts[0][1:], strict=False)
         for x0, x1 in zip(cuts[1], cuts[1][1:], strict=False)
-        if open_share[y0:y1, x0:x1].sum() > 1.0
+        if open_share[y0:y1, x0:x1].any()
     ]
     images = np.zeros((len(blocks), len(camera.colours), camera.window, camera.window), np.float32)
     for line in camera.lines:

@@ -139,7 +139,7 @@ def _transform(
     light: Complex[np.ndarray, "y x"], sines: Float[np.ndarray, "y x"], places_m: Float[np.ndarray, " n"]
 ) -> Complex[np.ndarray, " n"]:
     """Sum of exp(-2 pi i sine place) over cells, whose sines are gathered between the two nearest of many."""
-    most = float(np.abs(sines).max()) * (1 + 1e-9)
+    most = float(np.abs(sines).max()) * (1 + 1e-9) or 1.0  # all are 0 across a single row of cells
     place = (sines.ravel() / most + 1) * ((_BINS - 1) / 2)
     below = np.minimum(place.astype(int), _BINS - 2)
     part = place - below

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fab.aperture import RectangularAperture
 from fab.grid import Grid
 from sim.camera import Camera, Colour
 from sim.optic import HeightOptic
@@ -86,6 +87,23 @@ def test_the_camera_s_own_sensor_does_not_matter():
     waves = np.random.default_rng(0).uniform(0, 1, one.grid.shape)
     light = [np.abs(light_of(thin(waves, own), np.zeros(1), 30e-3)[0]) for own in (one, other)]
     np.testing.assert_allclose(*light, rtol=1e-4)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_single_line_of_cells_has_the_light_of_its_sum(axis: int):
+    """Across the line nothing changes near the axis; along it, every cell's path written out."""
+    shape, sides, place = ((1, 60), (60, 1))[axis], [PITCH, 60 * PITCH], 2e-6
+    opening = RectangularAperture((sides[axis], sides[1 - axis]))
+    own = Camera(Grid(shape, PITCH), opening, "fused_silica", (RED,), np.inf, 1e-6, 64, distance_m=6e-3)
+    waves = np.random.default_rng(5).uniform(0, 1, shape)
+    found, _ = light_of(thin(waves, own), np.array([0.0, place]), 6e-3)
+    assert found[axis] == pytest.approx([found[1 - axis, 0]] * 2, rel=1e-6)
+    at = (np.arange(60) - 29.5) * PITCH
+    path, seen = np.hypot(at, 6e-3), np.sinc(at / np.hypot(at, 6e-3) * PITCH / WAVE)
+    turns = np.exp(2j * np.pi * (waves.ravel() + (path - 6e-3 - place * at / path) / WAVE))
+    wanted = np.sum(turns * seen / path**2) * PITCH**2 * 6e-3 / (1j * WAVE) / np.sqrt(60 * PITCH**2)
+    # Bins of directions, and the single precision of the field.
+    assert abs(found[1 - axis, 1]) == pytest.approx(abs(wanted), rel=1e-4)
 
 
 @pytest.mark.parametrize("cells", [61, 60])

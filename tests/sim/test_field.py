@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,17 @@ def test_from_banks_at_field_angles():
     # A uniform world is as bright as the PSFs pass light, wherever one looks. Their centroids differ by hundredths of
     # a pixel, which stretches the image between nodes a dozen pixels apart by less than a thousandth.
     assert 0.4995 * min(energies) < frame.min() <= frame.max() < 0.5005 * max(energies)
+
+
+def test_nodes_lie_where_the_lens_images_their_angles():
+    """By the tangent, and 3 % farther out per squared tangent of 0.1: a pincushion."""
+    camera = replace(make_camera(64, 0.15e-3, 0.5e-3, 4e-6, 5), mapping="tangent", distortion=(3.0, 0.0))
+    dark, angles = np.zeros((1, 1, 5, 5), np.float32), (-0.1, 0.0, 0.2)
+    banks = [[PsfBank(dark, ("one",), (np.inf,), 4e-6, (y, x)) for x in angles] for y in angles[:2]]
+    optics = FieldOptics.of(banks, camera, (np.inf,))
+    t = np.tan(angles)
+    np.testing.assert_allclose(optics.x_m, 0.5e-3 * t * (1 + 3 * t**2), rtol=1e-12)
+    np.testing.assert_allclose(optics.y_m, optics.x_m[:2], rtol=1e-12)
 
 
 def test_refusals(rng):

@@ -20,8 +20,9 @@ def test_the_spectrum_has_the_variance_that_is_asked_for():
     power = photograph_spectrum(SIDE, VARIANCE)
     assert np.sum(power * spectrum_weights(SIDE)) == pytest.approx(VARIANCE)
     assert power[0, 0] == 0.0
-    # Twice the frequency has a quarter of the power.
+    # Twice the frequency has a quarter of the power, in whatever direction.
     assert power[0, 4] == pytest.approx(4 * power[0, 8])
+    assert [power[3, 4], power[-3, 4], power[5, 0], power[-5, 0]] == pytest.approx([power[0, 5]] * 4)
     for side, variance in ((1, 1.0), (8, 0.0), (8, np.inf)):
         with pytest.raises(ValueError, match="variance"):
             photograph_spectrum(side, variance)
@@ -74,6 +75,14 @@ def test_no_other_filter_is_better_in_the_mean():
     for _ in range(20):
         moved = best + 0.05 * (rng.normal(size=best.shape) + 1j * rng.normal(size=best.shape))
         assert error(moved) > error(best)
+
+
+def test_colours_are_filtered_each_by_itself():
+    signal, noise = photograph_spectrum(SIDE, VARIANCE), NOISE**2 / SIDE**2
+    colours = np.stack([discs()[:2], discs()[1:], discs()[::2]])
+    together = np.asarray(filter_errors(transfers(colours), signal, noise, False))
+    alone = [np.asarray(filter_errors(transfers(one), signal, noise, False)) for one in colours]
+    np.testing.assert_allclose(together, alone, rtol=1e-5)  # single precision
 
 
 def test_alike_blurs_leave_noise_alone_and_unlike_ones_their_difference():

@@ -5,10 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import fftconvolve
 
 from bench.reference import make_camera
 from fab.errors import InputError
-from sim.imaging.formation import Optics, capture, own_margin_px, shadow_px
+from sim.imaging.disc import shadow_disc
+from sim.imaging.formation import Optics, capture, lost_share, own_margin_px, shadow_px
 from sim.imaging.occlusion import Model, follows_light
 from sim.imaging.scene import Obstruction, Scene
 from sim.psf_bank import PsfBank
@@ -56,6 +58,31 @@ def test_a_scene_without_obstruction_is_one_convolution(rng):
     scene = Scene(scene_of(rng).background, np.inf)
     each = [np.asarray(capture(scene, optics_of(psf), model)) for model in ("paper", "radiometric")]
     np.testing.assert_allclose(each[0], each[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_an_open_scene_with_its_own_margin_loses_the_window_of_the_psf_alone(rng, model: Model):
+    from scipy.signal import convolve2d
+
+    psf, scene = blurs(rng, layers=1), Scene(scene_of(rng).background, np.inf)
+    image = np.asarray(capture(scene, optics_of(psf), model, border="own"))
+    scale = psf.sum(axis=(2, 3)) if model == "paper_release" else np.ones((1, 3))
+    wanted = [convolve2d(scene.background[c], psf[0, c] / scale[0, c], mode="valid") for c in range(3)]
+    np.testing.assert_allclose(image, wanted, atol=2e-6)  # rounding of float32 transforms
+
+
+def test_what_a_model_takes_away_is_told_of_one_obstruction(rng):
+    optics = optics_of(points(3))
+    scene = scene_of(rng)
+    share = np.asarray(lost_share(scene, optics_of(points()), "paper"))
+    # Points as PSFs make it the mask itself.
+    np.testing.assert_allclose(share, np.broadcast_to(scene.obstructions[0].mask, share.shape), atol=2e-6)
+    disc = shadow_disc(APERTURE_M * FOCAL_M / PIXEL_M / 0.1, 17)
+    covered = fftconvolve(np.pad(scene.obstructions[0].mask, 8, mode="reflect"), disc, mode="valid")
+    for model in ("radiometric", "reciprocal"):
+        np.testing.assert_allclose(lost_share(scene, optics_of(points()), model)[0], covered, atol=2e-6)
+    with pytest.raises(ValueError, match="one obstruction, but got 2"):
+        lost_share(scene_of(rng, (0.2, 0.1)), optics, "radiometric")
 
 
 def test_eq_10_as_printed(rng):

@@ -37,6 +37,27 @@ def test_a_psf_with_glare_is_the_convolution():
     assert found == pytest.approx(want[:, 4:25, 4:25], rel=1e-5)
 
 
+def test_transforms_leave_no_negative_light():
+    psf = np.zeros((65, 65))
+    psf[32, 32] = 1.0
+    assert Glare(share=0.0, window=31).scattered(psf).min() == 0.0
+
+
+def test_the_usual_glare_is_a_fiftieth_of_the_light_that_falls_with_the_square():
+    glare = Glare()
+    kernel = glare.kernel()
+    assert (glare.share, kernel.shape) == (0.02, (255, 255))
+    # Of 1 / (r² + 1.5²) less than a tenth lies on the middle pixel.
+    assert 0.98 < kernel.max() < 0.982
+    assert kernel[127, 127 + 100] / kernel[127, 127 + 10] == pytest.approx(102.25 / 10002.25, rel=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(9, 11), (8, 8), (2, 9, 7)])
+def test_a_psf_without_a_middle_or_not_square_has_no_glare(shape: tuple[int, ...]):
+    with pytest.raises(ValueError, match="odd square window"):
+        Glare(window=5).scattered(np.ones(shape))
+
+
 def test_no_glare_changes_nothing():
     psf = np.random.default_rng(2).uniform(size=(31, 31)).astype(np.float32)
     assert Glare(share=0.0, window=11).scattered(psf) == pytest.approx(psf, abs=1e-6)
@@ -48,7 +69,9 @@ def test_a_lens_of_a_kind_has_another_glare():
     assert np.std(np.log(shares)) == pytest.approx(0.3, rel=0.14)
 
 
-@pytest.mark.parametrize("wrong", [{"share": 1.0}, {"fall": 0.0}, {"core_px": -1.0}, {"window": 10}])
+@pytest.mark.parametrize(
+    "wrong", [{"share": 1.0}, {"share": 1.5}, {"share": -0.1}, {"fall": 0.0}, {"core_px": -1.0}, {"window": 10}]
+)
 def test_a_glare_that_cannot_be_is_refused(wrong: dict[str, float]):
     with pytest.raises(InputError):
         Glare(**wrong)  # pyright: ignore[reportArgumentType]

@@ -45,6 +45,25 @@ def test_pixels_against_the_integral():
     assert relative_error(got[24:27, 24:34], values * CAMERA.pixel_m**2) < 3e-3
 
 
+def test_a_few_rings_lit_from_nearby_are_the_integral():
+    """A small plate of random rings 4 mm behind a point, 30 midpoints per ring and 12 x 12 points per pixel."""
+    camera = make_camera(80, 0.16e-3, 0.29e-3, 1.85e-6, 9)
+    rings, pitch, scale = 40, camera.grid.pitch_m, YELLOW_M * camera.focal_length_m
+    profile, rate = noise_profile(rings), camera.waves_per_metre(YELLOW_M)
+    source = jnp.asarray(ring_source_waves(camera, 4e-3, YELLOW_M))
+    got = np.asarray(plan_hankel(camera, YELLOW_M).energy(jnp.asarray(profile, jnp.float32), source, jnp.float32(rate)))
+    fine = (np.arange(rings * 30) + 0.5) * pitch / 30
+    waves = np.repeat(profile, 30) * rate + (np.hypot(fine, 4e-3) - 4e-3) / YELLOW_M
+    points = (np.arange(12) - 5.5) / 12 * camera.pixel_m
+    y, x = ((camera.axis_m()[4:, None] + points).ravel() for _ in range(2))
+    places, index = np.unique(np.hypot(y[:, None], x).ravel().round(12), return_inverse=True)
+    field = j0(2 * np.pi / scale * np.outer(places, fine)) @ (np.exp(2j * np.pi * waves) * fine) * (pitch / 30)
+    density = np.abs(2 * np.pi / scale * field) ** 2 / (np.pi * camera.aperture_m**2 / 4)
+    wanted = density[index].reshape(5, 12, 5, 12).mean(axis=(1, 3)) * camera.pixel_m**2
+    # As above, and three sub-rings, over each of which the wave of the source turns by 0.06 waves at most.
+    assert relative_error(got[4:, 4:], wanted) < 4e-3
+
+
 def test_an_open_aperture_is_the_airy_disc():
     plan = plan_hankel(CAMERA, YELLOW_M)
     profile = jnp.zeros(ring_count(CAMERA))

@@ -50,12 +50,13 @@ def test_radiometric_light_is_what_every_layer_sends_and_nearer_ones_let_through
 
 def test_reciprocal_light_by_hand():
     """What each obstruction takes from the background, counted once, is missing; the common part lands elsewhere."""
+    layers = Layers(flat(0.8), (flat(0.7), flat(0.25)), (flat(0.2), flat(0.4)))
     kept = [jnp.stack([flat(0.6)]), jnp.stack([flat(0.7), flat(0.9)])]
     energies = (0.9, 0.8, 0.7, 0.3, 0.2, 0.5, 0.4)
-    far, near = 0.5 * 0.8, 0.25 * 0.5 * 0.8  # taken by the far obstruction, and by the near one of what is left
+    far, near = 0.7 * 0.8, 0.25 * 0.3 * 0.8  # taken by the far obstruction, and by the near one of what is left
     moved = 0.3 * (far - 0.4 * 0.8) + 0.2 * (near - 0.6 * 0.3 * 0.8)
-    wanted = 0.9 * 0.8 + 0.8 * 0.5 * 0.2 * 0.9 + 0.7 * 0.25 * 0.4 + moved - 0.5 * far - 0.4 * near
-    found = reciprocal(LAYERS, kept, lambda _, light: light, Plain(*energies))
+    wanted = 0.9 * 0.8 + 0.8 * 0.7 * 0.2 * 0.9 + 0.7 * 0.25 * 0.4 + moved - 0.5 * far - 0.4 * near
+    found = reciprocal(layers, kept, lambda _, light: light, Plain(*energies))
     assert mean(found) == pytest.approx(wanted, rel=1e-6)
 
 

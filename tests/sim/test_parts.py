@@ -28,6 +28,18 @@ def test_parts_add_up_to_the_psf(parts):
     assert np.linalg.norm(parts.whole - whole) < 0.01 * np.linalg.norm(whole)
 
 
+def test_parts_are_the_psf_exactly_however_little_is_open_in_them():
+    """Single cells, and cells on the rim of which a few per cent are open."""
+    camera = Camera(Grid((16, 16), 240e-6), 3.84e-3, "fused_silica", COLOURS, 8e-3, 2e-6, 41)
+    lens = HeightOptic.of(camera)
+    cut = aperture_parts(lens, np.inf, 16)
+    assert len(cut.psf) == np.count_nonzero(np.asarray(lens.coverage))
+    assert np.sum(cut.side_m**2) == pytest.approx(np.pi / 4 * camera.aperture_m**2, rel=1e-5)
+    whole = np.asarray(psf(lens, depths=np.inf).energy[:, 0])
+    # Pixels are integrated by sums of eight points here.
+    assert np.linalg.norm(cut.whole - whole) < 0.01 * np.linalg.norm(whole)
+
+
 def test_every_part_holds_the_energy_that_passes_it(parts):
     share = parts.side_m**2 / np.sum(parts.side_m**2)
     energy = parts.psf[:, 0].sum(axis=(1, 2)) / CAMERA.transmission(GREEN)

@@ -43,6 +43,15 @@ def test_the_predicted_error_is_that_of_speckle():
     assert weights.expected_error == pytest.approx(error, rel=0.03)
 
 
+@pytest.mark.parametrize("width", [0.8, 3.0, 3.3, 4.0])
+def test_mirrored_pixels_have_mirrored_weights(width: float):
+    """So a pixel takes as many samples on either side as it can."""
+    centres = np.array([20.0, 20.2, 21.4, 22.7])
+    one, other = (pixel_weights(at, width, 0.45, 44).matrix for at in (centres, 43 - centres))
+    same = np.mod(centres - (np.ceil(width) + 4) / 2, 1) != 0.5  # halfway between, either side will do
+    np.testing.assert_allclose(one[::-1, same], other[:, same], atol=1e-9)
+
+
 def test_denser_samples_are_better():
     errors = [
         pixel_weights(np.array([20.3, 21.8]), 1.5 * s, 1 / s, 60).expected_error for s in (1.0, 1.5, 2.05, 2.5, 4.0)

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim.propagation.pupil import DoeRows, cis, doe_field
+from sim.propagation.pupil import DoeRows, block_size, cis, doe_field, in_blocks
 from sim.source import MapColumns
 
 
@@ -30,6 +30,21 @@ def test_the_derivative_of_cis_is_a_quarter_turn():
     np.testing.assert_allclose(np.asarray(rate), 2j * np.pi * np.asarray(value), rtol=1e-6, atol=1e-6)
     sensitivity = jax.grad(lambda w: jnp.sum(cis(w).real))(waves)
     np.testing.assert_allclose(sensitivity, -2 * np.pi * np.sin(2 * np.pi * waves), atol=4e-5)
+
+
+def test_blocks_are_groups_of_rows_that_divide_them_or_the_last_is_padded():
+    """Whole groups of 32 for two threads, of 64 to 256 rows, and near 128."""
+    if jax.default_backend() != "cpu":
+        pytest.skip("blocks are for a processor's cache")
+    assert [block_size(n) for n in (1024, 480, 2400, 192, 64, 320)] == [128, 96, 96, 96, 64, 160]
+    assert [block_size(n) for n in (251, 100, 1000)] == [128, 128, 128]
+    leaf = jnp.arange(2 * 251 * 3, dtype=jnp.float32).reshape(251, 6)
+    (cut,) = in_blocks((leaf,), 128)
+    assert cut.shape == (2, 128, 6)
+    joined = np.asarray(cut).reshape(-1, 6)
+    np.testing.assert_array_equal(joined[:251], leaf)
+    assert not joined[251:].any()
+    assert in_blocks(leaf[:128], 64).shape == (2, 64, 6)
 
 
 def test_a_closed_row_gives_no_field():

@@ -58,6 +58,20 @@ def test_cells_vary_and_hang_together_as_they_should(length: float, shape: tuple
     assert abs(field.mean()) < 4 * np.sqrt(np.pi * length**2 / field.size + 1 / field.size)
 
 
+@pytest.mark.parametrize("shape", [(16, 17), (24, 9), (2, 31)])
+def test_the_filter_of_white_noise_has_the_covariance_at_every_lag(shape: tuple[int, int]):
+    """The field over the noise that it is made of, frequency by frequency: no sample of anything."""
+    length = 0.6
+    white = np.random.default_rng(4).standard_normal(shape, np.float32)
+    field = np.asarray(cell_roughness(Grid(shape, PITCH_M), RMS_M, length * PITCH_M, 4), np.float64) / RMS_M
+    found = np.fft.ifft2(np.abs(np.fft.fft2(field) / np.fft.fft2(white.astype(np.float64))) ** 2).real
+    along_y, along_x = (
+        [line_covariance(length, min(lag, count - lag)) for lag in range(count)] for count in shape
+    )  # it repeats at the edges
+    # Single precision, more of it where the noise happens to have little of a wave.
+    np.testing.assert_allclose(found, np.outer(along_y, along_x), atol=1e-4)
+
+
 def test_one_seed_gives_the_same_hills_whatever_their_height():
     grid = Grid((64, 48), PITCH_M)
     low, high, other = (

@@ -44,6 +44,18 @@ def test_colours_differ_by_their_quantum_efficiency():
     assert light.std(axis=(1, 2)) == pytest.approx(1 / np.sqrt(sensor.white_e(3).ravel()), rel=0.02)
 
 
+def test_the_brightest_light_fills_the_full_well_of_the_dimmest_colour():
+    sensor = Sensor(full_well_e=1000, exposure=0.5, quantum_efficiency=(0.3, 0.6), dark_e=10, black_level=64)
+    # White is 250 and 500 electrons, and 10 of 1000 are there in the dark.
+    assert sensor.most_light(2) == pytest.approx(990 / 250, rel=1e-6)
+    lights = np.array([0.99, 1.01]) * sensor.most_light(2)
+    none = dataclasses.replace(sensor, noise="none")
+    first, second = (np.asarray(expose(flat(light, 2, 1), none, KEY))[0, 0, 0] for light in lights.tolist())
+    assert first < sensor.top == second
+    # White is full scale where electrons are not counted.
+    assert Sensor(noise="tseng", exposure=0.5).most_light(3) == pytest.approx(1)
+
+
 def test_saturation_and_bits():
     sensor = Sensor(full_well_e=1000, exposure=1.0, read_noise_e=0, bits=8)
     raw = np.asarray(expose(flat(3.0), sensor, KEY))
