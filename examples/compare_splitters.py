@@ -43,7 +43,7 @@ LASERS = (
 class Task(NamedTuple):
     """Spots along x and y, period, and what equal light is worth, as drawn and as fabricated; other changes."""
 
-    count: tuple[int, int]
+    spots: tuple[int, int]
     period: str
     uniformity: float
     as_fabricated: float
@@ -79,7 +79,7 @@ def design_of(splitter: str, name: str, process: str, folder: Path, more: Sequen
     path = folder / "fan_out.toml"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, template_text("fan_out").encode())
-    changes = [f"spots.count={list(task.count)}", f"spots.period={task.period}", f"spots.uniformity={task.uniformity}"]
+    changes = [f"spots.count={list(task.spots)}", f"spots.period={task.period}", f"spots.uniformity={task.uniformity}"]
     if name == "as fabricated":
         changes.append(f"spots.uniformity_as_fabricated={task.as_fabricated}")
     return optimize(load_spec(path, [*SMALL, f"process.stock={process}", *task.changes, *changes, *more]))

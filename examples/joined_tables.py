@@ -132,8 +132,8 @@ def _row(row: MethodRow, lines: Lines, number: int, obstruction: str) -> TableRo
 
 def _interval(line: Mapping[str, str], mean: str, low: str, high: str) -> BootstrapInterval:
     pairs, pictures, seeds = (int(line[name]) for name in ("pairs", "pictures", "seeds"))
-    ends = [float(line[name]) if line[name] else None for name in (low, high)]
-    return BootstrapInterval(float(line[mean]), *ends, pairs, pictures, seeds)
+    first, last = (float(line[name]) if line[name] else None for name in (low, high))
+    return BootstrapInterval(float(line[mean]), first, last, pairs, pictures, seeds)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -92,6 +92,8 @@ def test_an_interval_of_independent_pictures_is_the_textbooks(rng: np.random.Gen
     values = rng.normal(20, 3, (1, 400))
     found = bootstrap_mean(values, [f"{k}" for k in range(400)])
     assert found is not None
+    assert found.low is not None
+    assert found.high is not None
     width = 2 * 1.96 * values.std(ddof=1) / np.sqrt(400)
     # 2000 resamples: a quantile near 2.5 % is known to 3 % of the width.
     assert found.high - found.low == pytest.approx(width, rel=0.1)
