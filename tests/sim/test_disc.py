@@ -28,6 +28,11 @@ def test_traced_and_known_diameters_agree():
         assert np.abs(traced - known).max() < known.max() * 0.25 / diameter
 
 
+def test_a_disc_that_is_kept_cannot_be_changed():
+    with pytest.raises(ValueError, match="read-only"):
+        np.asarray(shadow_disc(4.2, 7))[3, 3] = 1.0
+
+
 def test_gradient_by_the_diameter():
     ramp = jnp.abs(jnp.arange(41) - 20.0)
 

@@ -126,3 +126,12 @@ def test_interference_stays_within_what_two_fields_can_do(split: SplitPsf):
     # A leaked part that is not the plate's own goes beyond it.
     foreign = split._replace(leaked=0.2 * split.leaked)
     assert foreign.excess() > 1e-3
+
+
+def test_excess_by_hand():
+    """Twice the root of 4 times 9 is 12, of 13 that interfere; where light is less than none, nothing may."""
+    leaked, diffracted = np.array([[4.0, 0.5]]), np.array([[9.0, -0.01]])
+    split = SplitPsf(leaked + diffracted + np.array([[-13.0, 0.02]]), leaked, diffracted)
+    # Of the brightest pixel, which has 0.51.
+    assert split.excess() == pytest.approx(1 / 0.51)
+    assert split._replace(total=leaked + diffracted + np.array([[12.0, 0.5]])).excess() == pytest.approx(0.5 / 25)
