@@ -17,6 +17,8 @@ from jaxtyping import Float
 
 from fab.errors import InputError
 
+_MOST_DRAWN = 0.5  # of the light, scattered by another lens of a kind
+
 
 @dataclass(frozen=True)
 class Glare:
@@ -82,6 +84,8 @@ class Glare:
     def drawn(self, rng: np.random.Generator, spread: float) -> "Glare":
         """The glare of another lens of its kind: share and fall off by a relative standard deviation.
 
+        No draw scatters more than half of the light, or than this lens if that is more.
+
         Args:
             rng: where it is drawn from.
             spread: relative standard deviation of the share (of a logarithmic normal distribution, which knows no
@@ -89,4 +93,4 @@ class Glare:
         """
         share = self.share * float(np.exp(spread * rng.standard_normal()))
         fall = self.fall * float(np.exp(spread / 5 * rng.standard_normal()))
-        return replace(self, share=min(share, 0.5), fall=fall)
+        return replace(self, share=min(share, max(_MOST_DRAWN, self.share)), fall=fall)

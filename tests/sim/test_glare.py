@@ -67,6 +67,10 @@ def test_a_lens_of_a_kind_has_another_glare():
     shares = [Glare(share=0.02).drawn(np.random.default_rng(seed), 0.3).share for seed in range(400)]
     # The standard deviation of 400 draws is known to 3.5 %; four times that.
     assert np.std(np.log(shares)) == pytest.approx(0.3, rel=0.14)
+    hazy = [Glare(share=0.8).drawn(np.random.default_rng(seed), 0.3).share for seed in range(40)]
+    assert max(hazy) == 0.8
+    assert min(hazy) < 0.7
+    assert max(Glare(share=0.4).drawn(np.random.default_rng(seed), 0.3).share for seed in range(40)) == 0.5
 
 
 @pytest.mark.parametrize(
