@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -184,7 +185,7 @@ def test_bad_input(design: Design):
             certify(design, pieces=1, side=side)
     small = LevelMap(np.eye(3, dtype=np.uint8), LEVELS, Grid((3, 3), UM), 3 * UM, "small")
     with pytest.raises(InputError, match=r"side: squares must fit into the design of 3 cells, but got 4"):
-        certify(Design(small, CAMERA, (), (np.inf,)), pieces=1, side=4)
+        certify(Design(small, replace(CAMERA, grid=small.grid, aperture=3 * UM)), pieces=1, side=4)
     flat = design.level_map.with_level(np.zeros_like(design.level_map.level))
     with pytest.raises(InputError, match="must not be flat where rows are cut out"):
         certify(Design(flat, CAMERA, DEPTHS_M[:1], DEPTHS_M[1:]))
