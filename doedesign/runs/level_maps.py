@@ -18,6 +18,7 @@ from doedesign.runs.folder import (
     Run,
     open_run,
     require_relief,
+    run_of,
     spec_with,
 )
 from doedesign.runs.orders import own_order, require_order_of
@@ -137,7 +138,7 @@ def open_design(
     if isinstance(source, Design):
         return source
     require_source("design", source)
-    run = source if isinstance(source, Run) else open_run(Path(source))
+    run = run_of(source)
     level_map = level_map_of_run(run, levels)
     folder = Path(masks) if masks else None
     if masks is None and levels is None:

@@ -137,9 +137,10 @@ def _until_broken(
         # What was finished just before counts.
         lost = [future for future in flying if not future.done() or future.cancelled() or future.exception()]
         told = {future: future.result() for future in flying if future not in lost}
-        for found in [one for one in told.values() if not isinstance(one, _Untold)]:
-            note_effort(found.effort)
-        yield from ((flying[future], found.result) for future, found in told.items() if not isinstance(found, _Untold))
+        for future, found in told.items():
+            if not isinstance(found, _Untold):
+                note_effort(found.effort)
+                yield flying[future], found.result
         return [key for future, key in flying.items() if future in lost or isinstance(told[future], _Untold)]
     except BaseException:
         executor.shutdown(kill_workers=True)  # nobody waits for what is under way
@@ -174,8 +175,6 @@ def _worker_settings() -> dict[str, str]:
 # What follows runs in a worker.
 
 _HELD: dict[str, Work] = {}
-
-
 _said_s = 0.0  # processor time of this worker that was told
 
 

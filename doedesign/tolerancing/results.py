@@ -4,7 +4,6 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -17,7 +16,7 @@ from doedesign.tolerancing.plots import plot_histograms
 from doedesign.tolerancing.pool import Evaluate, predicted_rows
 from doedesign.tolerancing.result_files import write_results
 from doedesign.tolerancing.sensitivity import Effect, VarianceShare, source_shares
-from doedesign.tolerancing.studies import FORMAT, Study, study
+from doedesign.tolerancing.studies import FORMAT, Study, at_least_one, study
 from fab.draws import EXPECTED, NOMINAL, normal_keys, one_at_a_time_keys
 from fab.errors import InputError
 from fab.figure import html_of
@@ -196,9 +195,7 @@ def tolerance(
     where: dict[str, Any] = {"out": out, "workers": workers, "scheduler": scheduler, "evaluate": evaluate}
     asked = study(design, **settings, **where)
     # All draws first: mistakes in the questions show before anything is computed, and no worker waits between two.
-    if not isinstance(draws, Integral) or isinstance(draws, bool) or draws < 1:
-        raise InputError("draws", "must be at least 1, a whole number", repr(draws), "For example 100.")
-    keys = [NOMINAL, EXPECTED, *normal_keys(draws)]
+    keys = [NOMINAL, EXPECTED, *normal_keys(at_least_one("draws", draws))]
     if sensitivity == "one_at_a_time":
         keys += one_at_a_time_keys(asked.process)
     if sensitivity == "sobol":

@@ -135,7 +135,7 @@ class Study:
 
     def monte_carlo(self, draws: int = 100) -> Sample:
         """DOEs as the process makes them, rare events included."""
-        return self.sample(normal_keys(_at_least_one("draws", draws)))
+        return self.sample(normal_keys(at_least_one("draws", draws)))
 
     def corner_keys(self) -> list[str]:
         """Keys of `corners`; an InputError where nothing but rare events varies."""
@@ -181,7 +181,7 @@ class Study:
         if len(factors) < 2 or factors[0] != 0 or any(b <= a for a, b in pairwise(factors)):
             raise InputError("factors", "must grow from 0", tuple(factors), "For example 0, 0.5, 1, 2.")
         chosen_errors(self.process, what)
-        return [budget_keys(what, [factor], _at_least_one("draws", draws)) for factor in factors]
+        return [budget_keys(what, [factor], at_least_one("draws", draws)) for factor in factors]
 
     def budget(self, what: str, wanted: float = 0.9, draws: int = 100, factors: Sequence[float] = FACTORS) -> Budget:
         """Find how large some errors may be for a wanted yield, all others as they are.
@@ -304,7 +304,7 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, in_mem
         return partial(evaluate_there, address=scheduler)
     cells = design.level_map.level.size
     if workers is not None:
-        return partial(evaluate_here, workers=_at_least_one("workers", workers))
+        return partial(evaluate_here, workers=at_least_one("workers", workers))
     several = default_workers(cells * BYTES_PER_CELL)
 
     def run(model: DrawModel, draws: Mapping[str, Variation]) -> Iterator[tuple[str, Any]]:
@@ -313,7 +313,8 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, in_mem
     return run
 
 
-def _at_least_one(name: str, value: int) -> int:
+def at_least_one(name: str, value: int) -> int:
+    """Return a whole number of at least 1, the value of `name`; an InputError for anything else."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
         raise InputError(name, "must be at least 1, a whole number", repr(value), "For example 2.")
     return value
