@@ -83,7 +83,7 @@ def certify(
     *,
     masks: Path | None = None,
     cells: int = 24,
-    pieces: int | None = None,
+    pieces: int = 3,
     side: int = 2,
     json_: AsJson = False,
 ) -> None:
@@ -96,7 +96,7 @@ def certify(
         run: Run folder.
         masks: Its mask order; masks/NAME by default.
         cells: Cells of a row, 4 to 64; time grows with their third power.
-        pieces: Number of squares, 0 to 13; 3 by default, 0 where the extra "rigorous" is not installed.
+        pieces: Number of squares, 0 to 13.
         side: Cells of a square's side, 2 to 4; time grows with their sixth power.
     """
     from doedesign.runs.certificate import certify as prove

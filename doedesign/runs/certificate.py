@@ -31,7 +31,7 @@ from sim.rigorous.certificate import (
     cut_pieces,
     cut_rows,
 )
-from sim.rigorous.crossed import CROSSED_POLARISATIONS, has_crossed_solver, require_fmmax
+from sim.rigorous.crossed import CROSSED_POLARISATIONS
 from sim.rigorous.edge_optic import with_edges
 from sim.rigorous.rows import POLARISATIONS
 
@@ -99,7 +99,7 @@ def certify(
     masks: str | Path | None = None,
     *,
     cells: int = CELLS,
-    pieces: int | None = None,
+    pieces: int = PIECES,
     side: int = SIDE,
     out: str | Path | None = None,
 ) -> Certificate:
@@ -113,23 +113,18 @@ def certify(
         source: a design, a finished run or its folder.
         masks: mask order of the run, whose files are read; `masks/NAME` if there is one, else the run's own map.
         cells: cells of a row, 4 to 64; time grows with their third power.
-        pieces: number of squares, which need the extra `rigorous`; by default 3 where it is installed, else none.
+        pieces: number of squares.
         side: cells of a square's side, 2 to 4; time grows with their sixth power and with the heights in a square.
+            Larger ones than 2 are continued by mirrors through the middle of their outer cells.
         out: folder for the certificate (JSON, SI units) and its picture.
 
     Raises:
-        InputError: something that cannot be read, a number of cells or squares that is too small or too large, squares
-            without the package that solves them, or a design without relief.
+        InputError: something that cannot be read, a number of cells or squares that is too small or too large, or a
+            design without relief.
     """
     _check("cells", cells, _FEWEST, _MOST, CELLS)
-    _check("pieces", pieces or 0, 0, PLACES, PIECES)
+    _check("pieces", pieces, 0, PLACES, PIECES)
     _check("side", side, *_SIDES, SIDE)
-    if pieces is None:
-        pieces = PIECES if has_crossed_solver() else 0
-        if not pieces:
-            log.info("rows alone, no squares: solutions in two dimensions need pip install 'doedesign[rigorous]'")
-    elif pieces:
-        require_fmmax()
     design = open_design(source, masks)
     camera, height = design.camera, design.level_map.height_m
     if pieces and side > min(height.shape):

@@ -57,15 +57,6 @@ class CrossedOrders(NamedTuple):
         return found
 
 
-def has_crossed_solver() -> bool:
-    """Whether fmmax is installed."""
-    try:
-        require_fmmax()
-    except InputError:
-        return False
-    return True
-
-
 def require_fmmax() -> ModuleType:
     """Return the package; an InputError where it is missing."""
     try:

@@ -11,6 +11,7 @@ from jaxtyping import Complex, Float, Shaped
 from sim.rigorous.corner_light import CornerCell, corner_light, corner_unit
 from sim.rigorous.crossed import CROSSED_POLARISATIONS, crossed_orders
 from sim.rigorous.edge_widths import light_of_walls
+from sim.rigorous.mirrored.relief import is_mirrored, mirrored_orders
 from sim.rigorous.rows import Polarisation
 
 
@@ -22,7 +23,7 @@ class PieceComparison(NamedTuple):
     Attributes:
         scalar: `[y, x]` thin element, the same for both polarisations.
         edges: `[x and y, y, x]` thin element with edges, for light polarised along x and along y.
-        rigorous: `[x and y, y, x]` Fourier modes.
+        rigorous: `[x and y, y, x]` Maxwell's equations.
         energy: `[x and y]` reflected and transmitted light of the rigorous solution over the incident.
     """
 
@@ -110,6 +111,9 @@ def compare_piece(
 ) -> PieceComparison:
     """Orders of a square of glass cells in air that repeats along x and y, lit from the air at normal incidence.
 
+    Squares that are their own mirror image, as those of 2 x 2 cells are, are solved by `mirrored_orders`, in a fraction
+    of the time of others, which `crossed_orders` solves.
+
     Args:
         height_m: height of every cell.
         cell_m: width of a cell.
@@ -118,11 +122,12 @@ def compare_piece(
         terms: orders of the rigorous solution (`travelling_terms`).
 
     Raises:
-        InputError: fmmax is missing.
+        InputError: fmmax is missing, and the square has no mirrors.
     """
     height_m = np.asarray(height_m, np.float64)
     given = (height_m, cell_m, wavelength_m, index)
-    orders, face = crossed_orders(*given, terms), 4 * index / (1 + index) ** 2
+    solve, face = mirrored_orders if is_mirrored(height_m) else crossed_orders, 4 * index / (1 + index) ** 2
+    orders = solve(*given, terms)
     ny, nx = (count // 2 for count in height_m.shape)
     return PieceComparison(
         np.abs(thin_piece_amplitudes(*given)) ** 2,

@@ -1,7 +1,6 @@
 """The certificate of a design: in memory, on disk, and its words."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from sim.camera import Camera, Colour
 from sim.metrics import zeroth_order
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
-from sim.rigorous.crossed import has_crossed_solver
 from sim.rigorous.edge_optic import with_edges
 from tests.doedesign.small_runs import SPEC, call, finished_run
 
@@ -112,7 +110,6 @@ def test_words_say_what_to_believe(found: Certificate):
 @pytest.fixture(scope="module")
 def fine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Certificate, dict]:
     """Of a design with cells of a wavelength, whose squares have few terms."""
-    pytest.importorskip("fmmax")
     grid, folder = Grid((24, 24), 0.5 * UM), tmp_path_factory.mktemp("fine") / "certificate"
     camera = Camera(grid, 24 * 0.5 * UM, "fused_silica", COLOURS[:1], 1e-3, 3.7 * UM, 48)
     level = np.random.default_rng(0).integers(0, 4, (24, 24)).astype(np.uint8)
@@ -164,13 +161,6 @@ def test_words_speak_of_squares_where_there_are_some(fine: tuple[Certificate, di
         f"rigorous {100 * means['rigorous']:.2f} %"
     )
     assert not any("squares" in line for line in in_words(found))
-
-
-def test_squares_need_their_package(design: Design, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "fmmax", None)
-    with pytest.raises(InputError, match=r"solutions in two dimensions need fmmax.*doedesign\[rigorous\]"):
-        certify(design, cells=4, pieces=1)
-    assert has_crossed_solver() is False
 
 
 def test_bad_input(design: Design):
