@@ -67,6 +67,7 @@ def test_rows_of_a_rectangle_lie_at_shares_of_its_own_sides():
     # Beyond the rim nothing is cut out: of the cells 75 to 98 about that at 38 from the middle, 75 to 89 are inside.
     at_rim = cut_rows(PLACES, GRID, slit, 24, shares=(0.95,))[0]
     assert at_rim.height_m.tolist() == [4900.0 + column for column in range(75, 90)]
+    assert at_rim.centre_m == pytest.approx((-0.5 * PITCH_M, (82 - 49.5) * PITCH_M))
     assert all(np.abs(piece.centre_m[0]) < 20 * PITCH_M for piece in cut_pieces(PLACES, GRID, slit, 2, 4, cells=8))
 
 
