@@ -23,6 +23,7 @@ from sim.frames import CameraFrame
 
 Image = Float[np.ndarray, "y x"]
 _BORDER = 0.05  # of the shorter side: where a frame should hold background alone
+_HOT = 3.0  # standard deviations of a dark frame above its median
 _SEARCH = 1024  # samples per side on which the light is looked for
 
 
@@ -114,7 +115,9 @@ def _without_dark(
             raise InputError(name, "a dark frame must have its image's size", got, "Take it with the same settings.")
         light = frame.counts.astype(np.float64) - dark.counts
         # Electrons that heat sets free are as noisy as those of light; where a dark frame is bright, both frames are.
-        heat = np.maximum(dark.counts - np.median(dark.counts[frame.valid]), 0) / noise.gain_e
+        # What may be noise alone is no heat: half of all pixels would have some, and weigh less where they look dark.
+        above = dark.counts - np.median(dark.counts[frame.valid])
+        heat = np.where(above > _HOT * np.sqrt(read / dark_count), above, 0.0) / noise.gain_e
         floor, own = read + heat, (read + heat) / dark_count
     if not light[frame.valid].mean() > 0:
         got = f"a mean of {light[frame.valid].mean():.4g} counts above dark"

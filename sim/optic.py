@@ -27,7 +27,7 @@ from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 from sim.propagation.pupil import DoeRows, SourceColumns, cis, doe_field
-from sim.source import LitSource, SeparableSource, SourceMap, View, ViewedSource, light_of
+from sim.source import LitSource, SeparableSource, SourceMap, View, ViewedSource, depth_on_axis_m, light_of
 from sim.tracing import is_traced
 
 if TYPE_CHECKING:  # to a type checker, what subclasses define is no argument of a constructor here
@@ -72,7 +72,8 @@ class Optic(eqx.Module):
             depth_m: source depth.
             propagation: far field, or one of the direct kernels (for DOEs of cells); that of the camera if left out.
             sampling: intensity samples per lambda d / D (far field only); see `plan_far_field`.
-            field_rad: field angles (y, x); they matter to lenses that do not image sines (`Camera.mapping`).
+            field_rad: field angles (y, x); they matter to near sources, and to lenses that do not image sines
+                (`Camera.mapping`).
 
         Raises:
             InputError: a direct path where eq. 6 does not hold, or light too far aslant where there is no lens.
@@ -152,7 +153,7 @@ class CellOptic(CameraOptic):
             return plan_far_field(
                 self.camera,
                 line.wavelength_m,
-                depth_m=depth_m,
+                depth_m=depth_on_axis_m(depth_m, field_rad),
                 sampling=sampling,
                 field_rad=self.camera.chief_rad(field_rad) if self.camera.sees_field else ON_AXIS,
             )

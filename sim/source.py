@@ -93,6 +93,16 @@ def wrapped_waves(path_m: Float[np.ndarray, "*s"], wavelength_m: float) -> Float
     return waves.astype(np.float32)
 
 
+def depth_on_axis_m(depth_m: float, field_rad: tuple[float, float]) -> float:
+    """Depth on the axis from which light is as oblique to the cells as that of a source at field angles (y, x), metres.
+
+    About a chief ray of length c at an angle t to the axis a wave has the curvatures 1 / c across the plane of both and
+    cos² t / c in it; this is where their mean comes from.
+    """
+    cosine = 1 / float(np.sqrt(1 + np.sum(np.tan(field_rad) ** 2)))
+    return depth_m / (cosine * (1 + cosine**2) / 2)
+
+
 class MapColumns(NamedTuple):
     """Waves per metre of DOE height; the rows are the waves of the source."""
 

@@ -5,8 +5,9 @@ paper's sizes that means cells below a micrometre, which is why `sim.propagation
 serves as a reference and for small apertures. Two kernels: the paraxial `"fresnel"` transfer function exp(-i pi lambda
 d nu^2) and the `"angular_spectrum"` exp(2 pi i d sqrt(1/lambda^2 - nu^2)), both band-limited after K. Matsushima and T.
 Shimobaba, Opt. Express 17, 19662 (2009), so that the kernel itself never aliases: light that would leave the padded
-grid is dropped. The band ends in a cosine, because a sharp end rings: 2 % in the image of a rough plate. Without a lens
-it is how light gets to a sensor too near for the far field, cells then being squares instead of points.
+grid is dropped. The band ends in a cosine, because a sharp end rings: 2 % in the image of a rough plate. Cells are
+squares, of as many samples as the light between the rim and the window's corner needs. Without a lens it is how light
+gets to a sensor too near for the far field.
 """
 
 from typing import Literal, cast
@@ -111,7 +112,7 @@ def plan_direct(
             'Use the "far_field" path.',
         )
         raise InputError("camera.mapping", rule, camera.lens_text, cure)
-    parts = _parts(camera, wavelength_m, depth_m)
+    parts = _parts(camera, wavelength_m, depth_m, kernel)
     cells, pitch, distance = max(camera.grid.shape), camera.grid.pitch_m, camera.sensor_distance_m
     nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m) if camera.distance_m is None else 0.0
     if nyquist > camera.focal_length_m * (1 + 1e-9):
@@ -136,12 +137,16 @@ def plan_direct(
     padded = cast(int, next_fast_len(max(3 * cells, int(np.ceil((cells + 2 * half) / _UNTAPERED)))))
     cutoff = camera.opening.widest_m * pitch / (wavelength_m * distance)
     amount = pitch / np.sqrt(camera.opening.area_m2)
-    is_round, firsts, gathers, errors = isinstance(camera.opening, RoundAperture), [], [], []
+    is_round, is_bare = isinstance(camera.opening, RoundAperture), camera.distance_m is not None
+    firsts, gathers, errors = [], [], []
     for count in camera.grid.shape:
         middle = (count * parts - 1) / 2  # the axis, in samples of the propagated grid
         firsts.append(int(np.floor(middle)) - kept // 2)
         weights = pixel_weights(camera.axis_m() / pitch + middle - firsts[-1], width, cutoff, kept, is_round)
-        gathers.append(Banded.from_dense(weights.matrix * amount))
+        places = (np.arange(kept) + firsts[-1] - middle) * pitch
+        # Behind a lens all light at a place left the cells in one direction, where a square has its sinc.
+        envelope = np.ones(kept) if is_bare else np.sinc(places * pitch / (wavelength_m * distance)) ** 2
+        gathers.append(Banded.from_dense(weights.matrix * (amount * envelope)[:, None]))
         errors.append(weights.expected_error)
     square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x")[None, :] ** 2
     # `source_path_m` already holds the defocus remainder r^2/2 (1/d - 1/f), so what is left of the lens is -r^2/2d;
@@ -150,27 +155,27 @@ def plan_direct(
     return DirectPath(
         gather=(gathers[0], gathers[1]),
         lens=cis(jnp.asarray(lens)),
-        kernel=_kernel(padded, pitch, wavelength_m, distance, kernel, square_cells=camera.distance_m is not None),
+        kernel=_kernel(padded, pitch, wavelength_m, distance, kernel, square_cells=is_bare),
         first=(firsts[0], firsts[1]),
         parts=parts,
         expected_error=np.hypot(*errors),
     )
 
 
-def _parts(camera: Camera, wavelength_m: float, depth_m: float) -> int:
-    """Samples per cell and axis that carry light from one rim to the far corner of the window; one behind a lens.
+def _parts(camera: Camera, wavelength_m: float, depth_m: float, kernel: Kernel) -> int:
+    """Samples per cell and axis that carry light from one rim to the far corner of the window.
 
-    A sample is a square that is lit evenly, so a wave from a near source must turn little over it: an eighth of a wave
-    at the rim leaves 1 % of the light there.
+    A sample is a square that is lit evenly, but for the lens, so a wave from a near source must turn little over it: an
+    eighth of a wave at the rim leaves 1 % of the light there.
     """
-    if camera.distance_m is None:
-        return 1
-    bend = abs(camera.beam_curvature_per_m(wavelength_m)) + (0.0 if np.isinf(depth_m) else 1 / depth_m)
+    own = camera.curvature_per_m() if camera.distance_m is None else 0.0
+    own += camera.beam_curvature_per_m(wavelength_m)
+    bend = max(abs(own), abs(own + 1 / depth_m))  # of a star and of the nearest source
     turned = 8 * camera.grid.pitch_m * camera.opening.reach_m * bend / wavelength_m
     across = camera.opening.reach_m + camera.window * camera.pixel_m / np.sqrt(2)
-    sine = across / np.hypot(across, camera.distance_m)
+    far = camera.sensor_distance_m if kernel == "fresnel" else np.hypot(across, camera.sensor_distance_m)
     # Intensity has twice the band of the field.
-    return max(1, int(np.ceil(4 * camera.grid.pitch_m * sine / wavelength_m)), int(np.ceil(turned)))
+    return max(1, int(np.ceil(4 * camera.grid.pitch_m * across / far / wavelength_m)), int(np.ceil(turned)))
 
 
 def _kernel(

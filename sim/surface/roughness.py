@@ -62,8 +62,12 @@ def _gain(length: Any, size: int) -> Any:
     xp = jnp if is_traced(length) else np
     covariance = _covariance(length, size)
     around = xp.concatenate([covariance, covariance[1 : (size + 1) // 2][::-1]])
-    # Rounding can push the spectrum's tail below zero.
-    return xp.sqrt(xp.maximum(xp.fft.rfft(around).real, 1e-12)).astype(np.float32)
+    power = xp.fft.rfft(around).real
+    # Rounding can push the tail below zero, and hills of more than a quarter of the plate, which have a kink where they
+    # repeat, do: what there cannot be is taken from the rest, so that the variance stays.
+    there = xp.maximum(power, 1e-12)
+    counts = np.where(np.arange(len(power)) * 2 % size == 0, 1, 2)  # frequencies that each stands for
+    return xp.sqrt(there * ((counts * power).sum() / (counts * there).sum())).astype(np.float32)
 
 
 def _filtered_rows(field: Float[Array, "y x"] | Float[np.ndarray, "y x"], gain: Any) -> Any:

@@ -13,8 +13,6 @@ from sim.rigorous import certify_pieces, certify_rows, compare_piece, compare_ro
 from sim.rigorous.certificate import CertifiedPiece, CertifiedRow
 from sim.rigorous.crossed import travelling_terms
 
-pytestmark = pytest.mark.slow  # its fixtures take many seconds
-
 PITCH_M = 1.85e-6
 GRID = Grid((100, 100), PITCH_M)
 APERTURE = RoundAperture(100 * PITCH_M)
@@ -69,6 +67,7 @@ def test_rows_of_a_rectangle_lie_at_shares_of_its_own_sides():
     # Beyond the rim nothing is cut out: of the cells 75 to 98 about that at 38 from the middle, 75 to 89 are inside.
     at_rim = cut_rows(PLACES, GRID, slit, 24, shares=(0.95,))[0]
     assert at_rim.height_m.tolist() == [4900.0 + column for column in range(75, 90)]
+    assert at_rim.centre_m == pytest.approx((-0.5 * PITCH_M, (82 - 49.5) * PITCH_M))
     assert all(np.abs(piece.centre_m[0]) < 20 * PITCH_M for piece in cut_pieces(PLACES, GRID, slit, 2, 4, cells=8))
 
 
@@ -154,6 +153,7 @@ def certified_pieces() -> tuple[CertifiedPiece, ...]:
     return certify_pieces(squares, Camera(grid, 50e-6, "fused_silica", (GREEN,), 8e-3, 3.7e-6, 64), (552e-9,))
 
 
+@pytest.mark.slow  # squares take many seconds
 def test_the_finer_solution_of_a_square_is_the_one_that_is_told(certified_pieces: tuple[CertifiedPiece, ...]):
     assert len(certified_pieces) == 2
     one, index = certified_pieces[0], refractive_index("fused_silica", 552e-9)
@@ -168,6 +168,7 @@ def test_the_finer_solution_of_a_square_is_the_one_that_is_told(certified_pieces
     assert one.orders.energy == pytest.approx([1, 1], abs=0.01)
 
 
+@pytest.mark.slow  # squares take many seconds
 def test_a_picture_has_squares_beside_rows(
     certified: tuple[CertifiedRow, ...], certified_pieces: tuple[CertifiedPiece, ...]
 ):

@@ -78,15 +78,17 @@ def test_uniform_noise():
     assert drawn.std() == pytest.approx(0.008 / np.sqrt(3), rel=0.01)
 
 
-def test_gradient_is_that_of_the_fixed_standardised_draw():
-    """d/dx (x + sqrt(v(x)) z) by finite differences with the draw's own z."""
-    signal, key, sigma = jnp.asarray([0.5, 4.0, 30.0, 2000.0, 3e4]), jax.random.key(4), 2.0
+@pytest.mark.parametrize("scale", [1.0, 4e-5])
+def test_gradient_is_that_of_the_fixed_standardised_draw(scale: float):
+    """d/dx (x + sqrt(v(x)) z) by finite differences with the draw's own z; `scale` is the light of one count."""
+    signal, key, sigma = scale * jnp.asarray([0.5, 4.0, 30.0, 2000.0, 3e4]), jax.random.key(4), 2.0 * scale
     weights = jnp.asarray([0.3, -1.0, 2.0, 0.7, -0.2])
-    found = jax.grad(lambda x: jnp.sum(weights * photon_noise(key, x, sigma)))(signal)
+    noisy = partial(photon_noise, key, sigma=sigma, scale=scale)
+    found = jax.grad(lambda x: jnp.sum(weights * noisy(x)))(signal)
     x = np.asarray(signal, np.float64)
-    z = (np.asarray(photon_noise(key, signal, sigma), np.float64) - x) / np.sqrt(x + sigma**2)
+    z = (np.asarray(noisy(signal), np.float64) - x) / np.sqrt(scale * x + sigma**2)
     steps = 1e-4 * x
-    up, down = (x + s + np.sqrt(x + s + sigma**2) * z for s in (steps, -steps))
+    up, down = (x + s + np.sqrt(scale * (x + s) + sigma**2) * z for s in (steps, -steps))
     # Errors: 1e-8 of the differences, 1e-7 of single precision and of the rounding of the draw over its deviation.
     assert np.asarray(found) == pytest.approx(np.asarray(weights) * (up - down) / (2 * steps), rel=1e-4)
 
@@ -104,6 +106,21 @@ def test_gradient_is_the_slope_of_the_draws_themselves():
     # Rounded counts differ by at most 1 from smooth ones: 1 / (40 sqrt(2^18)) per pixel; terms beyond the square root
     # of the expansion change slopes by w / (72 mean^1.5), which is less.
     assert float(total(20.0) - total(-20.0)) / 40 == pytest.approx(slope, rel=2e-3)
+
+
+def test_a_full_pixel_of_just_so_many_counts_is_not_saturated():
+    signal, key = jnp.float32(50.0), jax.random.key(7)
+    drawn = float(photon_noise(key, signal, 0.0))
+    slopes = [float(jax.grad(partial(photon_noise, key, sigma=0.0, most=most))(signal)) for most in (drawn, drawn - 1)]
+    assert slopes == [pytest.approx(1 + (drawn - 50) / 100, rel=1e-5), 0.0]
+
+
+@pytest.mark.parametrize("mean", [0.4, 3.0, 7.99])
+def test_tails_down_to_one_in_a_million_are_summed(mean: float):
+    """Against the quantiles of the distribution; single precision knows shares near 1 to 6e-8."""
+    share = np.array([1e-6, 1e-3, 0.3, 0.9, 0.999, 1 - 1e-5, 1 - 1e-6])
+    found = noise._summed(jnp.full(share.shape, mean, jnp.float32), jnp.asarray(share, jnp.float32))
+    assert np.asarray(found).tolist() == stats.poisson.ppf(share, mean).tolist()
 
 
 def test_gradient_in_the_dark_stays_bounded():

@@ -60,6 +60,15 @@ def test_reciprocal_light_by_hand():
     assert mean(found) == pytest.approx(wanted, rel=1e-6)
 
 
+def test_what_a_third_obstruction_takes_is_what_two_others_leave():
+    masks = flat(0.7), flat(0.25), flat(0.5)
+    layers = Layers(flat(0.8), masks, (flat(0.0),) * 3)
+    kept = [jnp.ones((number + 1, *SHAPE)) for number in range(3)]
+    only_taken_by_the_third = Plain(*[0.0] * 9, 1.0)
+    found = reciprocal(layers, kept, lambda _, light: light, only_taken_by_the_third)
+    assert mean(found) == pytest.approx(-0.5 * 0.75 * 0.3 * 0.8, rel=1e-6)
+
+
 @pytest.mark.parametrize(("release", "gain"), [(False, 1.0), (True, GAIN)])
 @pytest.mark.parametrize("outside", ["scene", "nothing"])
 def test_eq_10_by_hand(release: bool, gain: float, outside):

@@ -1,5 +1,7 @@
 """Light by parts of the aperture: against the whole PSF, closed forms, and the wave optics of a shadowed aperture."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,22 @@ def test_parts_are_the_psf_exactly_however_little_is_open_in_them():
     whole = np.asarray(psf(lens, depths=np.inf).energy[:, 0])
     # Pixels are integrated by sums of eight points here.
     assert np.linalg.norm(cut.whole - whole) < 0.01 * np.linalg.norm(whole)
+
+
+def test_pixels_as_wide_as_many_specks_are_summed_finely():
+    """Pixels of ten times wavelength x distance / aperture, in the light of a rough plate."""
+    camera = Camera(Grid((24, 24), 20e-6), 0.48e-3, "fused_silica", COLOURS, 8e-3, 90e-6, 3)
+    optic = HeightOptic.of(camera, np.random.default_rng(3).uniform(0, 1.1e-6, (24, 24)))
+    whole = np.asarray(psf(optic, depths=np.inf).energy[:, 0])
+    assert np.linalg.norm(aperture_parts(optic, np.inf, 2).whole - whole) < 0.002 * np.linalg.norm(whole)
+
+
+def test_a_ray_to_a_part_meets_an_obstruction_as_triangles_say(parts):
+    """From a point on the axis at 0.4 m a ray is three quarters as far off the axis at 0.1 m as at the aperture."""
+    near = replace(parts, depth_m=0.4)
+    pixels_per_m = CAMERA.sensor_distance_m / 0.1 / CAMERA.pixel_m  # of the view, for lengths at 0.1 m
+    np.testing.assert_allclose(near.shift_px(0.1), -0.75 * parts.centre_m * pixels_per_m, rtol=1e-12)
+    np.testing.assert_allclose(near.side_px(0.1), 0.75 * parts.side_m * pixels_per_m, rtol=1e-12)
 
 
 def test_every_part_holds_the_energy_that_passes_it(parts):
