@@ -31,6 +31,8 @@ from sim.propagation.pupil import DoeRows, doe_field
 from sim.source import source_waves
 from sim.surface import as_fabricated
 
+_LIT = 0.9  # waves across a cell up to which it sends light; at 1 it is dark
+
 # Of an image: shifts along y and x in pixels, defocus in 1/m, and the camera's geometry (`QUANTITIES`).
 Motion = Float[np.ndarray, "7"]
 
@@ -70,7 +72,20 @@ def _energy(optic: _Optic, view: Int[Array, ""], plate: Transmission, motion: Fl
         plan = bent(plan, optic.camera, displacement_m(optic.camera, motion[3:], motion[:2]))
     light = plate[view] if optic.amplitude is None else plate[view] * optic.amplitude
     rows = DoeRows(None, None, light, (optic.source_waves, optic.axis))
-    return optic.factor * plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion[:3]))
+    energy = plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion[:3]))
+    y, x = (_along(motion[k], optic.rates[k], energy.shape[k]) for k in range(2))
+    return optic.factor * y[:, None] * x * energy
+
+
+def _along(shift_px: Float[Array, ""], waves_per_px: Float[Array, ""], pixels: int) -> Float[Array, " pixel"]:
+    """Light of a cell moved with its image, over that of one that sends it about the window's middle, along an axis.
+
+    A tilt that every cell takes for even moves what cells do together and not what each sends by itself, sinc² of the
+    waves across it. Where that is next to nothing it stays as it is.
+    """
+    waves = waves_per_px * (jnp.arange(pixels) - (pixels - 1) / 2)
+    lit = jnp.clip(waves, -_LIT, _LIT)
+    return jnp.where(waves == lit, jnp.sinc(lit - waves_per_px * shift_px) / jnp.sinc(lit), 1.0) ** 2
 
 
 @dataclass(frozen=True, eq=False)
