@@ -1,8 +1,8 @@
 """The model of a measurement: from errors of the process to the energies in the pixels of every image.
 
 The plate is `sim.surface.as_fabricated`'s, the light goes the far-field way. Every image has three numbers of its
-own besides: where its centre lies (a tilt across the pupil, so the model moves by any fraction of a pixel and the data
-never) and by how much its source lies off its depth (a curvature).
+own besides: where its centre lies (a tilt across the pupil, and what cells send by themselves moved with it, so the
+model moves by any fraction of a pixel and the data never) and by how much its source lies off its depth (a curvature).
 
 A plate and its images can be differentiated backwards, from a gradient with respect to the pixels to one with respect
 to errors and motions; the light of all images goes back through one plate.
