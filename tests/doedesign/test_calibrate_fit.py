@@ -392,20 +392,26 @@ def test_the_uncertainty_of_a_reading_is_the_scatter_of_many(image: int):
 @pytest.mark.parametrize(("image", "radius_px"), [(0, NEAR_PX), (1, FAR_PX)])
 def test_the_uncertainty_of_a_reading_is_that_of_pixels_and_background(image: int, radius_px: float):
     """Of ring over disc and of the share in a spot, by their slopes; as much wider as the images' misfit says."""
-    found = search(analytic_objective(TRUTH))
+    plain, bright = analytic_objective(TRUTH), 5 * disc(2.0, (0.0, 0.0))  # without it a background hardly matters
+    assert isinstance(plain.model, AnalyticModel)
+    patterns = plain.model.patterns.copy()
+    patterns[:, 0] += bright
+    shown = tuple(one._replace(psf=one.psf._replace(rate=one.psf.rate + bright)) for one in plain.targets)
+    found = search(FitObjective(replace(plain.model, patterns=patterns), shown))
     at, fitted, posterior = found.at, found.at.matches[image], posterior_of(found)
     inner = disc(radius_px + 1, tuple(at.objective.motion(at.scores, image)[:2]))
     light = (fitted.target.psf.rate - fitted.background) / fitted.gain
     inside, total = (inner * light).sum(), light.sum()
     slope = 1 / inside - inner * total / inside**2 if image == 0 else inner / total - inside / total**2
-    variance = (slope**2 / fitted.weights).sum() + slope.sum() ** 2 / fitted.weights.sum()
+    by_pixels, by_background = (slope**2 / fitted.weights).sum(), slope.sum() ** 2 / fitted.weights.sum()
+    assert by_background > 0.05 * by_pixels
     key = (f"image{image}", ("ring_to_disc", "far_spot")[image])
     for inflation in (1.0, 3.0):
         every = readings(found, posterior._replace(inflation=inflation))
         measured = next(one.measured for one in every if (one.image, one.quantity) == key)
         assert measured is not None
         # Discs of samples.
-        assert measured[1] == pytest.approx(inflation * np.sqrt(variance) / fitted.gain, rel=5e-3)
+        assert measured[1] == pytest.approx(inflation * np.sqrt(by_pixels + by_background) / fitted.gain, rel=5e-3)
 
 
 def test_the_uncertainty_of_a_prediction_is_that_of_errors_and_motions():

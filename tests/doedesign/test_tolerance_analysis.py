@@ -213,6 +213,9 @@ def test_the_worst_plate_is_farthest_beyond_a_limit():
     # 0.2 below 0.3 is worse than 0.04 above 0.035, against the size of the limits.
     limits = [limit_from_text("far_spot >= 0.3"), limit_from_text("zeroth_order <= 3.5 %")]
     assert limited(TWO, limits).worst_draw == "normal/1"
+    # And 0.04, twice what may be, is worse than a fifth less than may be, of a larger number.
+    limits = [limit_from_text("far_spot >= 0.25"), limit_from_text("zeroth_order <= 2 %")]
+    assert limited(TWO, limits).worst_draw == "normal/0"
 
 
 def test_one_at_a_time_finds_slope_and_curvature(ask: Callable[..., Study]):
