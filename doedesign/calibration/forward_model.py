@@ -1,8 +1,8 @@
 """The model of a measurement: from errors of the process to the energies in the pixels of every image.
 
 The plate is `sim.surface.as_fabricated`'s, the light goes the far-field way. Every image has three numbers of its
-own besides: where its centre lies (a tilt across the pupil, so the model moves by any fraction of a pixel and the data
-never) and by how much its source lies off its depth (a curvature).
+own besides: where its centre lies (a tilt across the pupil, and what cells send by themselves moved with it, so the
+model moves by any fraction of a pixel and the data never) and by how much its source lies off its depth (a curvature).
 
 A plate and its images can be differentiated backwards, from a gradient with respect to the pixels to one with respect
 to errors and motions; the light of all images goes back through one plate.
@@ -30,6 +30,8 @@ from sim.propagation.farfield import FarField, bent, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
 from sim.source import source_waves
 from sim.surface import as_fabricated
+
+_LIT = 0.9  # waves across a cell up to which it sends light; at 1 it is dark
 
 # Of an image: shifts along y and x in pixels, defocus in 1/m, and the camera's geometry (`QUANTITIES`).
 Motion = Float[np.ndarray, "7"]
@@ -70,7 +72,20 @@ def _energy(optic: _Optic, view: Int[Array, ""], plate: Transmission, motion: Fl
         plan = bent(plan, optic.camera, displacement_m(optic.camera, motion[3:], motion[:2]))
     light = plate[view] if optic.amplitude is None else plate[view] * optic.amplitude
     rows = DoeRows(None, None, light, (optic.source_waves, optic.axis))
-    return optic.factor * plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion[:3]))
+    energy = plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion[:3]))
+    y, x = (_along(motion[k], optic.rates[k], energy.shape[k]) for k in range(2))
+    return optic.factor * y[:, None] * x * energy
+
+
+def _along(shift_px: Float[Array, ""], waves_per_px: Float[Array, ""], pixels: int) -> Float[Array, " pixel"]:
+    """Light of a cell moved with its image, over that of one that sends it about the window's middle, along an axis.
+
+    A tilt that every cell takes for even moves what cells do together and not what each sends by itself, sinc² of the
+    waves across it. Where that is next to nothing it stays as it is.
+    """
+    waves = waves_per_px * (jnp.arange(pixels) - (pixels - 1) / 2)
+    lit = jnp.clip(waves, -_LIT, _LIT)
+    return jnp.where(waves == lit, jnp.sinc(lit - waves_per_px * shift_px) / jnp.sinc(lit), 1.0) ** 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -216,6 +216,69 @@ def test_the_posterior_of_a_linear_model_is_the_inverse_of_its_normal_matrix():
     assert posterior.spread(gradient) == pytest.approx(np.sqrt(gradient @ posterior.covariance @ gradient))
 
 
+def weighed(found: Linearization, factor: float) -> Linearization:
+    """The same fit by somebody who takes all variances for this factor smaller."""
+    at = found.at.reweighted(tuple(factor * each for each in found.at.weights))
+    return at.linearised(found.jacobian)
+
+
+def test_chi2_is_told_per_pixel_that_is_left():
+    """Of two images of 18 x 18 pixels less four places, two gains, two backgrounds and two errors."""
+    found = search(analytic_objective(TRUTH, gain_sigma=None))
+    left = 2 * SIDE**2 - 4 - 2 - 2 - 2
+    # What the prior says of errors is a thousandth of what the images say.
+    assert posterior_of(found).chi2_per_pixel == pytest.approx(found.at.chi2 / left, rel=1e-4)
+
+
+def test_noise_that_was_understated_is_made_up_for_and_no_more():
+    """Of nine times the weight chi2 is nine times as large, and standard deviations are what they were."""
+    found = search(analytic_objective(TRUTH, gain_sigma=None))
+    plain, bold, timid = (posterior_of(weighed(found, factor)) for factor in (1.0, 9.0, 0.25))
+    stretched = max(plain.chi2_per_pixel, 1.0) / plain.chi2_per_pixel  # where noise is overstated nothing is made of it
+    np.testing.assert_allclose(bold.sigma, plain.sigma / np.sqrt(stretched), rtol=0.05)  # blocks scatter a little
+    assert bold.inflation == pytest.approx(3 * np.sqrt(plain.chi2_per_pixel), rel=1e-3)
+    assert timid.inflation == 1.0
+    rises = cost_rises(weighed(found, 9.0), bold)
+    assert rises == pytest.approx([1.0] * 4, abs=0.1)  # a model that is a little curved
+
+
+def test_what_images_leave_to_the_prior_is_not_widened():
+    """An error that no image shows is as uncertain as before, however badly images are explained."""
+    objective = analytic_objective(TRUTH, gain_sigma=None)
+    hidden = patterns_of(objective).copy()
+    hidden[:, 2] = 0.0
+    assert isinstance(objective.model, AnalyticModel)
+    found = search(FitObjective(replace(objective.model, patterns=hidden), objective.targets))
+    posterior = posterior_of(weighed(found, 9.0))
+    assert posterior.inflation > 3
+    assert posterior.ratio[1] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_misfits_that_differ_from_place_to_place_widen_standard_deviations():
+    """A patch of 3 x 3 pixels with more of an error's pattern: the sandwich of the gradients of 6 x 6 such patches."""
+    objective = analytic_objective(TRUTH, images=1, gain_sigma=None)
+    target, extra = objective.targets[0], np.zeros((SIDE, SIDE))
+    extra[6:9, 3:6] = 4 * SIGMA[0] * patterns_of(objective)[0, 1, 6:9, 3:6]
+    found = search(
+        FitObjective(objective.model, (target._replace(psf=target.psf._replace(rate=target.psf.rate + extra)),))
+    )
+    match_, slopes = found.at.matches[0], found.jacobian.of_residuals(found.at)[0].reshape(-1, SIDE, SIDE)
+    pulls = np.sqrt(match_.weights) * match_.residual
+    scatter = np.zeros((len(slopes), len(slopes)))
+    for row in range(0, SIDE, 3):
+        for column in range(0, SIDE, 3):
+            patch = (slice(row, row + 3), slice(column, column + 3))
+            gradient = (slopes[:, *patch] * pulls[patch]).sum(axis=(1, 2))
+            scatter += np.outer(gradient, gradient)
+    inverse = np.linalg.inv(found.half_hessian)
+    posterior = posterior_of(found)
+    even = np.linalg.inv(found.hessians[0] / posterior.inflation**2 + np.eye(len(slopes)))
+    sandwich = np.diag(inverse @ scatter @ inverse)[:2]
+    assert sandwich[0] > 1.2 * even[0, 0]
+    expected = np.sqrt(np.maximum(sandwich, np.diag(even)[:2])) * SIGMA
+    np.testing.assert_allclose(posterior.sigma, expected, rtol=1e-6)
+
+
 def test_what_finer_cells_would_show_counts_as_a_standard_deviation():
     """Images that would be brighter by the first error's pattern: the fit would end that much lower."""
     objective = analytic_objective(TRUTH, gain_sigma=None)
@@ -324,6 +387,31 @@ def test_the_uncertainty_of_a_reading_is_the_scatter_of_many(image: int):
         values.append(measured[0])
         stated.append(measured[1])
     assert np.mean(stated) == pytest.approx(np.std(values, ddof=1), rel=0.3)  # three standard deviations of 60
+
+
+@pytest.mark.parametrize(("image", "radius_px"), [(0, NEAR_PX), (1, FAR_PX)])
+def test_the_uncertainty_of_a_reading_is_that_of_pixels_and_background(image: int, radius_px: float):
+    """Of ring over disc and of the share in a spot, by their slopes; as much wider as the images' misfit says."""
+    plain, bright = analytic_objective(TRUTH), 5 * disc(2.0, (0.0, 0.0))  # without it a background hardly matters
+    assert isinstance(plain.model, AnalyticModel)
+    patterns = plain.model.patterns.copy()
+    patterns[:, 0] += bright
+    shown = tuple(one._replace(psf=one.psf._replace(rate=one.psf.rate + bright)) for one in plain.targets)
+    found = search(FitObjective(replace(plain.model, patterns=patterns), shown))
+    at, fitted, posterior = found.at, found.at.matches[image], posterior_of(found)
+    inner = disc(radius_px + 1, tuple(at.objective.motion(at.scores, image)[:2]))
+    light = (fitted.target.psf.rate - fitted.background) / fitted.gain
+    inside, total = (inner * light).sum(), light.sum()
+    slope = 1 / inside - inner * total / inside**2 if image == 0 else inner / total - inside / total**2
+    by_pixels, by_background = (slope**2 / fitted.weights).sum(), slope.sum() ** 2 / fitted.weights.sum()
+    assert by_background > 0.05 * by_pixels
+    key = (f"image{image}", ("ring_to_disc", "far_spot")[image])
+    for inflation in (1.0, 3.0):
+        every = readings(found, posterior._replace(inflation=inflation))
+        measured = next(one.measured for one in every if (one.image, one.quantity) == key)
+        assert measured is not None
+        # Discs of samples.
+        assert measured[1] == pytest.approx(inflation * np.sqrt(by_pixels + by_background) / fitted.gain, rel=5e-3)
 
 
 def test_the_uncertainty_of_a_prediction_is_that_of_errors_and_motions():

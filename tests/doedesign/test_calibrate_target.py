@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from doedesign.calibration.target import MeasuredImage, Target, match, weights_at
+from doedesign.calibration.target import MeasuredImage, Target, match, target_of, weights_at
 from sim.measured import MeasuredPsf
 
 RNG = np.random.default_rng(7)
@@ -54,3 +54,30 @@ def test_derivatives_of_residuals_give_the_gradient_of_chi2(gain_sigma: float | 
         high, low = (match(seen, weights, model + step * column).chi2 for step in (1e-5, -1e-5))
         # A difference of numbers of 1e2 over 2e-5, in double precision.
         assert gradient[k] == pytest.approx((high - low) / 2e-5, rel=1e-5, abs=1e-6)
+
+
+def blobs(side: int, place: tuple[float, float]) -> np.ndarray:
+    """Three spots of which none is like another, and whose centre of light lies at a place (y, x) from the middle."""
+    y, x = (np.arange(side) - (side - 1) / 2 - at for at in place)
+    spots = ((5.0, -1.0, -4.0), (3.0, -1.0, 4.0), (2.0, 4.0, 4.0))  # light, y, x: centred together
+    return sum(light * np.exp(-np.add.outer((y - b) ** 2, (x - a) ** 2) / 4) for light, b, a in spots)  # pyright: ignore
+
+
+@pytest.mark.parametrize("place", [(5.3, -4.4), (-3.2, 6.1), (0.3, -0.4)])
+@pytest.mark.parametrize("brightness", [None, 400.0])
+def test_an_image_is_cut_where_it_looks_like_the_model(place: tuple[float, float], brightness: float | None):
+    """Found by its centre up to six pixels off, it lies within one of the window's middle, and where it says."""
+    middle, rate = (31.5, 31.5), 30 * blobs(64, place)
+    # Where `rate` has 30 times the light of the model, its variance is a thousandth of it and a little more.
+    psf = MeasuredPsf(rate, np.full(rate.shape, 0.3), np.full(rate.shape, 1e-3), np.ones(rate.shape, bool))
+    known = None if brightness is None else (brightness, 0.02)
+    found = target_of(MeasuredImage("a", 0.1, psf, middle, known), 32, blobs(32, (0.0, 0.0)))
+    light, around = found.psf.rate, np.arange(32) - 15.5
+    centre = [(light.sum(axis=1 - axis) * around).sum() / light.sum() for axis in (0, 1)]
+    assert max(map(abs, found.shift_px)) <= 1
+    assert found.shift_px == pytest.approx(centre, abs=0.1)  # a parabola through three pixels of a peak
+    # In units of all light in the window, or of that on the aperture.
+    assert found.scale == pytest.approx(brightness or rate.sum(), rel=1e-3)
+    np.testing.assert_allclose(
+        found.psf.variance(light), (0.3 + 1e-3 * light * found.scale) / found.scale**2, rtol=1e-9
+    )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import foldnorm
 
 from doedesign.spec import LimitSpec
 from doedesign.tolerancing import result_files
@@ -212,6 +213,9 @@ def test_the_worst_plate_is_farthest_beyond_a_limit():
     # 0.2 below 0.3 is worse than 0.04 above 0.035, against the size of the limits.
     limits = [limit_from_text("far_spot >= 0.3"), limit_from_text("zeroth_order <= 3.5 %")]
     assert limited(TWO, limits).worst_draw == "normal/1"
+    # And 0.04, twice what may be, is worse than a fifth less than may be, of a larger number.
+    limits = [limit_from_text("far_spot >= 0.25"), limit_from_text("zeroth_order <= 2 %")]
+    assert limited(TWO, limits).worst_draw == "normal/0"
 
 
 def test_one_at_a_time_finds_slope_and_curvature(ask: Callable[..., Study]):
@@ -230,6 +234,16 @@ def test_one_at_a_time_finds_slope_and_curvature(ask: Callable[..., Study]):
     assert corners.low is None
     assert corners.variance == pytest.approx((1 - 2 / math.pi) * 0.02**2)
     assert changes["overlay_x_m[0]", "zeroth_order", None].variance == 0
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.05, 0.25, 0.5, 1.0, 1.5, 3.0])
+def test_an_error_folded_at_zero_varies_as_a_folded_normal_one(ask: Callable[..., Study], fakes, mean: float):
+    """Of an effect in proportion to the error the variance is that of |mean + z|; below zero there is nothing."""
+    process = Process(fakes.LEVELS, spreads={"corner_radius_m": Normal(mean * 0.2e-6, 0.2e-6)})
+    effects = {(one.quantity, one.colour): one for one in ask(process=process).one_at_a_time()}
+    # Beyond two standard deviations it is taken for normal: 7 % less at two, 0.5 % at three.
+    exact = 0.02**2 * float(np.asarray(foldnorm.var(mean)))
+    assert effects["far_spot", None].variance == pytest.approx(exact, rel=0.006 if mean > 2 else 1e-9)
 
 
 def test_an_error_that_leaves_the_model_leaves_nothing_to_share():
@@ -283,6 +297,15 @@ def test_sobol_indices_are_the_same_every_time_and_need_a_power_of_two(ask: Call
             ask().sobol(count)
 
 
+def test_plates_beyond_the_model_count_as_the_worst_of_the_others_in_sobol_indices(ask: Callable[..., Study], fakes):
+    """Shifts of more than a standard deviation are refused; the study still has shares, and overlay the largest."""
+    some = dataclasses.replace(
+        ask(evaluate=fakes.refused), run=lambda model, plates: ((key, model(one)) for key, one in plates.items())
+    )
+    found = {one.source: one.total.value for one in some.sobol(32) if (one.quantity, one.colour) == ("strehl", None)}
+    assert max(found, key=lambda source: found[source]) == "overlay"
+
+
 @pytest.mark.slow
 def test_the_budget_for_overlay_agrees_with_the_one_worked_out(ask: Callable[..., Study]):
     asked = ask(limits=["strehl >= 0.9"])
@@ -326,6 +349,10 @@ def test_a_result_holds_what_was_asked_for(toleranced: Callable[..., ToleranceRe
     assert {key.partition("/")[0] for key in few.keys} == {"nominal", "expected", "normal"}
     assert set(few.keys) < set(more.keys)
     assert toleranced().effects
+    # Of the worst row of every plate, and with what sources do together.
+    for quantity, shares in more.shares.items():
+        own = [one for one in more.variance_shares if (one.quantity, one.colour) == (quantity, None)]
+        assert shares == {one.source: one.total.value for one in own}
 
 
 PICTURE = np.linspace(0.0, 1.0, 16).reshape(4, 4)
@@ -389,6 +416,15 @@ def test_a_limit_on_what_is_not_there_leaves_earlier_results(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_result_in_words_names_the_source_behind_the_limit_that_most_plates_break(
+    toleranced: Callable[..., ToleranceResult],
+):
+    """All plates break that of the far spot, which depth and corners move; none that of the Strehl ratio."""
+    for limits in (["strehl >= 0.0", "far_spot >= 0.9"], ["far_spot >= 0.9", "strehl >= 0.0"]):
+        # Two depth errors of 0.02 and one of 0.36 of that variance: 85 %.
+        assert "most important: depth, 85 % of the variance of the far spot" in str(toleranced(limits=limits))
+
+
 def test_a_result_in_words_ends_with_the_sigmas_that_a_budget_allows(toleranced: Callable[..., ToleranceResult], fakes):
     few = toleranced(sensitivity="none")
 
@@ -419,6 +455,8 @@ def test_a_budget_that_no_error_size_decides(fakes):
     beyond = budget_of(process, "overlay", 0.9, (0, 1, 2), yields(1.0, 0.99, 0.95))
     assert (beyond.verdict, beyond.factor) == ("beyond", 2)
     assert str(beyond) == "overlay x 2 still gives a yield of 90 %"
+    just = budget_of(process, "overlay", 0.9, (0, 1, 2), yields(1.0, 0.95, 0.9))
+    assert (just.verdict, just.factor) == ("beyond", 2)
     never = budget_of(process, "overlay", 0.9, (0, 1, 2), yields(0.7, 0.6, 0.5))
     assert (never.verdict, never.factor, never.low, never.high) == ("out of reach", 0, 0, 0)
     assert "no budget gives a yield of 90 %" in str(never)
