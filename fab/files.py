@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.units import named_kind
 
 MANIFEST_NAME = "manifest.json"
 # A field with this mark is left out of records where it is its default, so that records without it stay what they are.
@@ -59,6 +60,18 @@ def explain_os_error(error: OSError, path: str | Path) -> InputError:
     """Turn an operating-system error about a path into the `InputError` to raise from it."""
     rule, cure = _CURES.get(error.errno or 0, ("the path must be usable", "Check the path and the disk."))
     return InputError(str(path), rule, f'"{error.strerror or error}"', cure)
+
+
+def path_of(value: object, name: str = "path") -> Path:
+    """Return the path of a file or a folder, given as text or as a path, the value of `name`.
+
+    Raises:
+        InputError: anything else, such as what is to be written there, no text at all, or text that no path may have.
+    """
+    if not isinstance(value, str | os.PathLike) or not str(value) or "\0" in str(value):
+        got = repr(value) if isinstance(value, str) else named_kind(type(value))
+        raise InputError(name, "must be the path of a file or a folder", got, 'For example "out/plate.npz".')
+    return Path(value)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from doedesign.recon.reconstruction import Reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, reconstruct_tiled
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
 from fab.errors import InputError
-from fab.files import sha256_file
+from fab.files import path_of, sha256_file
 from sim.metrics import mean_wavelength_m
 from sim.psf_bank import PsfBank
 from sim.store import is_own_bank, read_bank
@@ -111,7 +111,7 @@ class Model:
         Raises:
             InputError: files that are missing, broken, or do not belong together.
         """
-        places = (Path(folder) / "trained", Path(folder))
+        places = (path_of(folder, "folder") / "trained", Path(folder))
         home = next((place for place in places if (place / NETWORK_NAME).is_file()), None)
         if home is None:
             cure = "Train one (`doedesign.train`), or give the folder of a released model."

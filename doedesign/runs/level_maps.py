@@ -25,7 +25,7 @@ from doedesign.runs.orders import own_order, require_order_of
 from doedesign.spec import HEIGHT_FILES
 from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
-from fab.files import sha256_file
+from fab.files import path_of, sha256_file
 from fab.grid import Grid
 from fab.height import HeightMap, outline_of, read_height
 from fab.layout.geometry import pixel_edges
@@ -102,6 +102,10 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
     return LevelMap.from_height(height, levels, run.spec.name, wrapped=True)
 
 
+# What a bare height map needs to be drawn (`drawing_from`).
+GEOMETRY = ("step_m", "etch_depths_m", "pitch_m", "scale_m", "aperture_m")
+
+
 def require_source(name: str, source: object) -> None:
     """Raise an InputError for what is no design, run or path; a plate of one's own is made a design first."""
     if not isinstance(source, Design | Run | str | Path):
@@ -140,7 +144,7 @@ def open_design(
     require_source("design", source)
     run = run_of(source)
     level_map = level_map_of_run(run, levels)
-    folder = Path(masks) if masks else None
+    folder = path_of(masks, "masks") if masks else None
     if masks is None and levels is None:
         folder = own_order(run.spec.name, run.folder, level_map)
     redrawn = levels not in (None, levels_from_spec(run.spec.process).count)

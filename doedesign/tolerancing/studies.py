@@ -39,7 +39,7 @@ from fab.draws import (
     variation_at,
 )
 from fab.errors import InputError
-from fab.files import sha256_bytes
+from fab.files import path_of, sha256_bytes
 from fab.process import DEVIATIONS, Process, Variation, error_names
 from fab.units import require_kind
 from sim.camera import Camera
@@ -259,7 +259,7 @@ def study(
     given = [given] if isinstance(given, str) else given
     obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in given)
     bare = _for_workers(design)
-    journal = Journal(None if out is None else Path(out), _identity(bare, made, seed, evaluate), DrawLines())
+    journal = Journal(None if out is None else path_of(out, "out"), _identity(bare, made, seed, evaluate), DrawLines())
     run = _runner(design, workers, scheduler, out is None)
     return Study(bare, made, obeyed, seed, journal, evaluate, run, quiet)
 

@@ -18,7 +18,7 @@ from fab.layout.polygons import rectangles
 from fab.level_map import LevelMap
 from fab.solids.columns import BASE_M, PixelWindow
 from fab.solids.step import Body, boxes, write_step
-from fab.units import format_length
+from fab.units import format_length, number_of
 
 _MOST_BOXES = 2000
 _MOST_PIXELS = 1000
@@ -33,12 +33,20 @@ class Patch:
         y_m: the same along y.
         width_m: its edge, metres; the nearest whole number of pixels is taken.
         step: whether it is wanted as STEP, too, and not only as a mesh.
+
+    Raises:
+        InputError: something other than a number of metres.
     """
 
     x_m: float
     y_m: float
     width_m: float
     step: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("x_m", "y_m", "width_m"):
+            if math.isnan(number_of(value := getattr(self, name))):
+                raise InputError(f"patch: {name}", "must be a number of metres", repr(value), "For example 50e-6.")
 
     def window(self, grid: Grid) -> PixelWindow:
         """Return the pixels nearest to the patch, which must lie on the map."""
