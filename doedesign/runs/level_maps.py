@@ -1,6 +1,7 @@
 """Level maps and designs from a run, its mask files, or a height map of the user's own."""
 
 import logging
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -237,8 +238,7 @@ def drawing_from(
     levels = Levels(count, step_m, tuple(etch_depths_m))
     relief = aperture_m if aperture_m is None or isinstance(aperture_m, str) else aperture_from(aperture_m)
     height = read_any_height(source, pitch_m, scale_m, relief)
-    # Mask shops take ASCII names; a name of other letters alone leaves nothing.
-    name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
+    name = _ascii_name(source.stem)
     try:
         level_map = LevelMap.from_height(height, levels, name, wrapped=_is_wrapped(height, levels))
     except InputError as error:
@@ -246,6 +246,12 @@ def drawing_from(
         raise InputError(f"{source}{part}", error.rule, error.got, error.cure) from error
     origin = {"kind": "height map", "name": source.name, "height_sha256": sha256_file(source)}
     return Drawing(level_map, origin, None)
+
+
+def _ascii_name(stem: str) -> str:
+    """Turn the name of a file into one that mask shops take, ASCII without accents; "height" where nothing is left."""
+    plain = "".join(c for c in unicodedata.normalize("NFKD", stem) if not unicodedata.combining(c))
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in plain).strip("_") or "height"
 
 
 def _kept_light(design: Design, own: LevelMap) -> float:
