@@ -74,6 +74,11 @@ def path_of(value: object, name: str = "path") -> Path:
     return Path(value)
 
 
+def paths_of(value: object, name: str) -> tuple[Path, ...]:
+    """Return the paths of files, of one or of a tuple or list of them, the value of `name`; see `path_of`."""
+    return tuple(path_of(one, name) for one in (value if isinstance(value, tuple | list) else [value]))
+
+
 @contextmanager
 def os_errors_explained(path: str | Path) -> Iterator[None]:
     """Turn every operating-system error within this block into an `InputError` that names the path."""

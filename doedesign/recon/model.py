@@ -28,7 +28,8 @@ from doedesign.recon.reconstruction import Reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, reconstruct_tiled
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
 from fab.errors import InputError
-from fab.files import path_of, sha256_file
+from fab.files import path_of, paths_of, sha256_file
+from fab.units import distance_from
 from sim.metrics import mean_wavelength_m
 from sim.psf_bank import PsfBank
 from sim.store import is_own_bank, read_bank
@@ -155,11 +156,11 @@ class Model:
 
     def psfs(
         self,
-        files: Sequence[Path] = (),
+        files: str | Path | Sequence[str | Path] = (),
         *,
         pixel_m: float | None = None,
-        near_m: float | None = None,
-        far_m: float | None = None,
+        near_m: float | str | None = None,
+        far_m: float | str | None = None,
     ) -> PsfPair:
         """PSFs of the scene and of the obstruction, the model's own or those of files.
 
@@ -167,8 +168,9 @@ class Model:
             files: one bank, or two files, of the scene and of the obstruction. A file of another program (channels R,
                 G, B, or one) is taken as measured, and scaled to the energy of the model's own PSF.
             pixel_m: pixel pitch of measured PSFs, metres; only with files.
-            near_m: distance of the obstruction; the middle, in 1/z, of what the network was trained on if None.
-            far_m: distance of the scene; if None what the network was trained for, or the farthest of the PSFs where it
+            near_m: distance of the obstruction, metres or with a unit; if None the middle, in 1/z, of what the network
+                was trained on.
+            far_m: the same of the scene; if None what the network was trained for, or the farthest of the PSFs where it
                 does not say that or they have none of it.
 
         Raises:
@@ -177,7 +179,9 @@ class Model:
         if pixel_m is not None and not files:
             rule, cure = "goes with PSFs of another program", "Give their files, too, or leave it out."
             raise InputError("pixel_m", rule, "the model's own PSFs", cure)
-        near_m = middle_depth_m(self.near_m) if near_m is None else near_m
+        near_m = middle_depth_m(self.near_m) if near_m is None else distance_from(near_m, "near_m")
+        far_m = far_m if far_m is None else distance_from(far_m, "far_m")
+        files = paths_of(files, "files")
         if not files:
             own_m = self._usual_far_m(self.bank) if far_m is None else far_m
             return _pair(self.bank, self.bank, own_m, near_m)

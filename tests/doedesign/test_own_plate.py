@@ -171,6 +171,13 @@ def test_the_run_sheet_of_ones_own_plate_says_what_it_is_made_of_and_what_light_
         ),
         (lambda: dd.area_table(DESIGN, "square"), "target: must be an AreaTarget, but got a str"),
         (lambda: dd.focus_table(DESIGN, 5e-3), "foci: must be a Foci, but got a float"),
+        (lambda: dd.simulate_files(DESIGN, "out"), r"design: must have a spec, .* but got none\. Of one picture: dd"),
+        (lambda: dd.simulate_files("run", "out"), "design: must be a Design, but got a str"),
+        (lambda: dd.reconstruct_files("model", [], "out"), "model: must be a Model, but got a str"),
+        (lambda: dd.import_objectives("x.toml"), r"spec: must be a Spec, but got a str\. Read it"),
+        (lambda: dd.tolerance(DESIGN, process="stepper", limits=3), r"limits: must be .*, as text, but got \[3\]"),
+        (lambda: dd.tolerance(DESIGN, process="stepper", limits=[3]), r"limits: must be .* but got \[3\]"),
+        (lambda: dd.tolerance(DESIGN, process="stepper", seed="0"), "seed: must not be negative, a whole .*'0'"),
     ],
 )
 def test_other_slips_of_a_notebook_are_told(call, told, tmp_path, monkeypatch):

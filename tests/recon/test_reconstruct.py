@@ -89,6 +89,19 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
         np.testing.assert_allclose(srgb_from_linear(other.light), srgb_from_linear(one.light), atol=SIXTEEN)
 
 
+@pytest.mark.usefixtures("annotations_unchecked")
+def test_paths_may_be_text(tmp_path: Path, run: Path, capture: Path):
+    """A folder that was text ended in an AttributeError, and one capture was taken for its letters."""
+    model = Model.open(run)
+    assert reconstruct_files(model, str(capture), str(tmp_path / "out")) == [tmp_path / "out" / "capture.exr"]
+    given: Any = [3]
+    with pytest.raises(InputError, match="captures: must be the path of a file or a folder, but got an int"):
+        reconstruct_files(model, given, tmp_path / "out")
+    asked: Any = {"tile": "32"}
+    with pytest.raises(InputError, match=r"tile, overlap: tile must be a multiple of \d+, but got 32"):
+        reconstruct_files(model, capture, tmp_path / "out", **asked)
+
+
 def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Path):
     out = tmp_path / "out"
     reconstruct(run, [capture], out, near_m=0.07, kind=".png", beside=True)
