@@ -20,7 +20,7 @@ from jaxtyping import Float, Num
 
 from doedesign.capture.image_files import read_image
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, read_json, sha256_file
+from fab.files import MANIFEST_NAME, path_of, read_json, sha256_file
 from fab.pictures import read_pixels, write_pixels
 from sim.frames import RAW_FILES, open_raw
 from sim.light import linear_from_srgb
@@ -92,7 +92,7 @@ def write_reconstruction(path: str | Path, display: Float[np.ndarray, "c y x"], 
         InputError: another ending, or the system refuses the path.
         ValueError: PNG cannot hold floats, or another number of bits.
     """
-    path = Path(path)
+    path = path_of(path)
     suffix = path.suffix.lower()
     if suffix not in WRITTEN_FILES:
         rule = f"a picture must be one of {', '.join(WRITTEN_FILES)}"
@@ -153,6 +153,7 @@ def photo_from_array(values: Num[np.ndarray, "..."], linear: bool | None = None,
     Raises:
         InputError: another shape or another type, or values that are not finite.
     """
+    values = np.asarray(values)
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (1, 3)):
         rule, got = "must be one picture, grey or in red, green and blue", f"pixels of shape {values.shape}"
         raise InputError(name, rule, got, _CURE)

@@ -172,6 +172,15 @@ def test_the_run_sheet_of_ones_own_plate_says_what_it_is_made_of_and_what_light_
         (lambda: dd.area_table(DESIGN, "square"), "target: must be an AreaTarget, but got a str"),
         (lambda: dd.focus_table(DESIGN, 5e-3), "foci: must be a Foci, but got a float"),
         (lambda: dd.simulate_files(DESIGN, "out"), r"design: must have a spec, .* but got none\. Of one picture: dd"),
+        (
+            lambda: dd.simulate(np.ones((16, 16)), DESIGN, obstruction=3, occlusion="paper"),
+            "obstruction: must be a kind of .* but got 3",
+        ),
+        (lambda: dd.write_report(3), "run: must be a design, a run or its folder, but got a int"),
+        (
+            lambda: dd.explain_ratio(DESIGN, dd.Targets("550 nm", 0.01, 1.0), process="stepper"),
+            "probe: must be positive, but got '550 nm'",
+        ),
         (lambda: dd.simulate_files("run", "out"), "design: must be a Design, but got a str"),
         (lambda: dd.reconstruct_files("model", [], "out"), "model: must be a Model, but got a str"),
         (lambda: dd.import_objectives("x.toml"), r"spec: must be a Spec, but got a str\. Read it"),

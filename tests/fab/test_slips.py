@@ -95,6 +95,7 @@ BLANK = LevelMap(np.zeros((4, 4), np.uint8), SIXTEEN, GRID, 8e-6)
         (lambda: read_level_map("a\0b"), "path: must be the path"),
         (lambda: read_height("", "1 um"), "path: must be the path of a file or a folder, but got ''"),
         (lambda: metres(np.zeros(3), "depth", infinite=True), "depth: must be metres or text"),
+        (lambda: GRID.axis_m("z"), """axis: must be "x" or "y", but got 'z'"""),
         (lambda: BLANK.plot("x.png"), r"ax: must be an Axes, but got a str\. Leave it out for a new figure; .*save"),
     ],
 )

@@ -15,7 +15,9 @@ from fab.levels import Levels
 from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.illumination import EvenBeam, GaussianBeam, MeasuredBeam
+from sim.imaging.formation import Optics, capture
 from sim.imaging.glare import Glare
+from sim.imaging.scene import Scene
 from sim.material import fresnel_transmission, full_wave_height_m, refractive_index
 from sim.metrics import encircled_energy, energy_budget, ring_to_disc
 from sim.optic import HeightOptic
@@ -32,6 +34,8 @@ CAMERA = Camera(Grid((32, 32), 2e-6), 60e-6, "fused_silica", COLOURS, 1e-3, 2e-6
 EVEN = np.ones((8, 8))
 BANK = PsfBank(np.ones((1, 2, 8, 8)), ("green",), (0.05, np.inf), 2e-6)
 BARE = HeightOptic.of(CAMERA)
+SCENE = Scene(np.ones((1, 8, 8), np.float32), 5.0)
+OPTICS = Optics(np.ones((1, 1, 3, 3), np.float32), 60e-6, 1e-3, 2e-6)
 FLAT = np.zeros((32, 32), np.uint8)
 IDEAL = Process(Levels(4, 300e-9))
 
@@ -105,6 +109,10 @@ IDEAL = Process(Levels(4, 300e-9))
         (lambda: Glare("2 %"), r"glare\.share: must lie from 0 to below 1, but got '2 %'"),
         (lambda: Glare(window=2.5), r"glare\.window: must be a whole, odd number"),
         (lambda: Glare(core_px=None), r"glare\.core_px: must be a positive number"),
+        (lambda: capture(EVEN, OPTICS, "paper"), r"scene: must be a Scene, but got a ndarray\. For example sim\.Scene"),
+        (lambda: capture(SCENE, BANK, "paper"), "optics: must be an Optics, but got a PsfBank"),
+        (lambda: capture(SCENE, replace(OPTICS, aperture_m=-1e-3), "paper"), "optics: aperture_m: must be a positive"),
+        (lambda: capture(SCENE, replace(OPTICS, pixel_m="2 um"), "paper"), "optics: pixel_m: .* but got '2 um'"),
         (lambda: mtf(BARE, count=0), "count: must be a whole number of frequencies, 2 or more, but got 0"),
         (lambda: write_bank(BANK, "b.exr"), "bank: must be a PsfBank, but got a str"),
         (lambda: write_bank(3, BANK), "path: must be the path of a file or a folder, but got an int"),

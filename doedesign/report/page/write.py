@@ -58,6 +58,9 @@ def write_report(
 
 
 def _folder_of(run: "Design | Run | str | Path") -> Path:
+    if not isinstance(run, str | Path) and not hasattr(run, "folder"):
+        rule, cure = "must be a design, a run or its folder", 'For example "runs/NAME".'
+        raise InputError("run", rule, f"a {type(run).__name__}", cure)
     folder = run if isinstance(run, str | Path) else run.folder
     if folder is None:
         cure = "Optimise it into a folder, or give that of its run."
