@@ -110,7 +110,7 @@ def distance_from(value: float | str, name: str) -> float:
     """Return `value`, a positive distance in metres or text with a unit ("5 cm", "inf"), in metres; see `metres`."""
     distance = metres(value, name, infinite=True)
     if not distance > 0:
-        raise InputError(name, "must be positive", format_length(distance), 'For example "5 cm", or inf.')
+        raise InputError(name, "must be a positive distance", format_length(distance), 'For example "5 cm", or inf.')
     return distance
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from doedesign.recon.model import Model, PsfPair
-from doedesign.recon.photos import WRITTEN_FILES, Photo, read_capture, write_reconstruction
+from doedesign.recon.photos import WRITTEN_FILES, Photo, read_capture, require_capture, write_reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, plan_tiles
 from doedesign.runs.folder import alone_in
 from doedesign.runtime.progress import meter
@@ -69,6 +69,8 @@ def reconstruct_files(
     """
     require_kind("model", model, Model, 'Open one by dd.Model.open("runs/NAME/trained").')
     captures, folder = paths_of(captures, "captures"), path_of(folder, "folder")
+    for capture in captures:  # said before a folder is made, and before those ahead of it take their time
+        require_capture(capture)
     names = [_with_beside(name, beside) for name in _names(captures, kind)]
     _require_own_folder(folder, captures, [name for each in names for name in each])
     multiple = model.network.layout.multiple

@@ -181,23 +181,23 @@ class Model:
             raise InputError("pixel_m", rule, "the model's own PSFs", cure)
         near_m = middle_depth_m(self.near_m) if near_m is None else distance_from(near_m, "near_m")
         far_m = far_m if far_m is None else distance_from(far_m, "far_m")
-        files = paths_of(files, "files")
-        if not files:
+        paths = list(paths_of(files, "files"))
+        if not paths:
             own_m = self._usual_far_m(self.bank) if far_m is None else far_m
             return _pair(self.bank, self.bank, own_m, near_m)
-        if len(files) > 2:
+        if len(paths) > 2:
             rule = "must be one bank, or one file of the scene and one of the obstruction"
-            raise InputError("psf", rule, f"{len(files)} files", "Give one or two.")
+            raise InputError("psf", rule, f"{len(paths)} files", "Give one or two.")
         usual = self._usual_far_m(self.bank) if far_m is None else far_m
         banks = [
             self._fitted(read_bank(path, pixel_m, depth), path, depth)
-            for path, depth in zip(files, (usual, near_m), strict=False)
+            for path, depth in zip(paths, (usual, near_m), strict=False)
         ]
         if len(banks) == 1 and len(banks[0].depths_m) == 1:
             rule = "PSFs of the scene and of the obstruction are needed"
-            raise InputError(str(files[0]), rule, "one depth", "Give two files, first that of the scene.")
+            raise InputError(str(paths[0]), rule, "one depth", "Give two files, first that of the scene.")
         far_m = self._usual_far_m(banks[0]) if far_m is None else far_m
-        digests = {path.name: sha256_file(path) for path in files}
+        digests = {path.name: sha256_file(path) for path in paths}
         return _pair(banks[0], banks[-1], far_m, near_m)._replace(digests=digests)
 
     def _usual_far_m(self, bank: PsfBank) -> float:

@@ -103,7 +103,7 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
         raise InputError("spec", rule, f"a {type(path).__name__}", cure)
     path = Path(path)
     raw = read_toml(path, *_FILES[Spec])
-    given = overrides if isinstance(overrides, tuple | list) else [overrides]
+    given: Any = overrides if isinstance(overrides, tuple | list) else [overrides]
     if not all(isinstance(text, str) for text in given):
         rule, cure = "must be several changes, as text", 'For example ["process.levels=8"].'
         raise InputError("overrides", rule, repr(overrides), cure)

@@ -255,7 +255,7 @@ def study(
     if out is not None and "<" in evaluate.__qualname__:
         rule = "must be a function at the top of a module, for a study on disk is known by its name"
         raise InputError("evaluate", rule, evaluate.__qualname__, "Move it there.")
-    given = limits if limits is not None else design.spec.limits if design.spec else ()
+    given: Any = limits if limits is not None else design.spec.limits if design.spec else ()
     given = given if isinstance(given, tuple | list) else [given]
     if not all(isinstance(one, str | LimitSpec) for one in given):
         raise InputError("limits", "must be several conditions, as text", repr(given), 'For example ["strehl >= 0.6"].')

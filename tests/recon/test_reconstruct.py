@@ -89,6 +89,15 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
         np.testing.assert_allclose(srgb_from_linear(other.light), srgb_from_linear(one.light), atol=SIXTEEN)
 
 
+def test_a_capture_that_is_none_is_told_before_the_first_is_reconstructed(tmp_path: Path, run: Path, capture: Path):
+    """It left a folder of no results, or was told after those before it."""
+    (tmp_path / "notes.md").write_text("no picture")
+    for wrong in ("notes.md", "missing.png"):
+        with pytest.raises(InputError, match=wrong):
+            reconstruct(run, [capture, tmp_path / wrong], tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.usefixtures("annotations_unchecked")
 def test_paths_may_be_text(tmp_path: Path, run: Path, capture: Path):
     """A folder that was text ended in an AttributeError, and one capture was taken for its letters."""

@@ -86,7 +86,7 @@ IDEAL = Process(Levels(4, 300e-9))
         (lambda: BANK.plot("x.png"), "ax: must be an Axes, but got a str"),
         (lambda: BANK.with_camera("lens"), r"camera: must be a Camera, but got a str\. A design has one"),
         (lambda: ring_to_disc(EVEN, None, 0.05), "camera: must be a Camera, but got a NoneType"),
-        (lambda: ring_to_disc(EVEN, CAMERA, -0.05), r"depth_m: must be positive, but got -50 mm\."),
+        (lambda: ring_to_disc(EVEN, CAMERA, -0.05), r"depth_m: must be a positive distance, but got -50 mm\."),
         (lambda: energy_budget(EVEN, EVEN, 0.05, COLOURS[0]), "optic: must be a DOE of cells, but got a ndarray"),
         (lambda: energy_budget(BARE, EVEN, np.nan, COLOURS[0]), "depth_m: must be metres"),
         (lambda: energy_budget(BARE, EVEN, 0.05, "green"), "colour: must be a Colour, but got a str"),
