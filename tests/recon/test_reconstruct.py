@@ -277,7 +277,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
             {"near_m": -0.1},
         ),
         "nan depth": (
-            "far_m: must be a positive distance",
+            "far_m: must be metres or text with a unit",
             {"far_m": np.nan},
         ),
         "order": (
