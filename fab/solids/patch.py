@@ -7,6 +7,7 @@ millions of triangles, so either has a cap.
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from fab.layout.polygons import rectangles
 from fab.level_map import LevelMap
 from fab.solids.columns import BASE_M, PixelWindow
 from fab.solids.step import Body, boxes, write_step
-from fab.units import format_length, number_of
+from fab.units import format_length
 
 _MOST_BOXES = 2000
 _MOST_PIXELS = 1000
@@ -45,7 +46,7 @@ class Patch:
 
     def __post_init__(self) -> None:
         for name in ("x_m", "y_m", "width_m"):
-            if math.isnan(number_of(value := getattr(self, name))):
+            if not isinstance(value := getattr(self, name), Real):  # one beyond the map, or NaN, is told with its size
                 raise InputError(f"patch: {name}", "must be a number of metres", repr(value), "For example 50e-6.")
 
     def window(self, grid: Grid) -> PixelWindow:
