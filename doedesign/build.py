@@ -26,7 +26,7 @@ from fab.order.terms import OrderTerms
 from fab.pictures import read_pixels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from fab.stock import IDEAL, STOCK, process_from
-from fab.units import format_length
+from fab.units import format_length, require_kind
 from sim.camera import Camera, Colour
 from sim.illumination import Beam, EvenBeam, GaussianBeam, MeasuredBeam, power_through
 
@@ -41,8 +41,9 @@ def camera_from_spec(spec: Spec) -> Camera:
     """Return lens, sensor, substrate and DOE grid of a spec.
 
     Raises:
-        InputError: a beam whose picture cannot be used, or that misses the aperture.
+        InputError: something other than a spec, a beam whose picture cannot be used, or one that misses the aperture.
     """
+    require_kind("spec", spec, Spec, 'Read it by dd.load_spec("spec.toml").')
     camera = Camera(
         grid=Grid(spec.doe.shape, spec.doe.pitch_m),
         # Light passes the opening in the chrome, which is smaller than what is etched.
@@ -129,8 +130,11 @@ def process_from_spec(spec: Spec | ProcessSpec, chosen: Levels | None = None) ->
     standard deviation are zero are left out of its spreads.
 
     Raises:
-        InputError: the depths are still to be chosen.
+        InputError: something other than these, or the depths are still to be chosen.
     """
+    if not isinstance(spec, Spec | ProcessSpec):
+        cure = 'Read it by dd.load_spec("spec.toml"); a stock process is fab.process_from("contact_aligner", levels).'
+        require_kind("spec", spec, Spec, cure)
     spec = spec.process if isinstance(spec, Spec) else spec
     full = spec.filled()
     defects = full.defects.in_si()

@@ -47,7 +47,7 @@ from doedesign.spec import Spec, input_files, load_spec, spec_warnings
 from doedesign.spec.values import MOST_STEPS
 from fab.errors import InputError
 from fab.figure import drawn_beside
-from fab.files import canonical_json, write_atomic
+from fab.files import canonical_json, path_of, write_atomic
 from fab.height import HeightMap
 from fab.levels import Levels
 from fab.plots.height import plot_height
@@ -111,7 +111,7 @@ def optimize(
     require_options(spec, str(spec.file or spec.name))  # not first when captures are made
     files = input_files(spec)
     if out is not None:
-        return _optimize_in(Path(out), spec, files, overrides, objectives or {}, overwrite)
+        return _optimize_in(path_of(out, "out"), spec, files, overrides, objectives or {}, overwrite)
     if (aimed := _aimed_design(spec)) is not None:
         return replace(aimed, edge_moves_m=spec.wafer.edge_moves_m)
     problem, sources = problem_of(spec, files, objectives)
@@ -145,7 +145,7 @@ def steps_within(
     """
     if not 0 < budget_s < float("inf"):
         raise InputError("budget", "must be positive seconds", budget_s, "For example 60.")
-    if out is not None and (kept := steps_of_run(Path(out), spec)) is not None:
+    if out is not None and (kept := steps_of_run(path_of(out, "out"), spec)) is not None:
         return kept
     if not (spec.objectives or spec.aims):
         raise InputError("budget", "there must be something to improve", "no objective", "Leave it out.")

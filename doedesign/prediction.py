@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from doedesign.design.design import Design
 from fab.level_map import LevelMap
 from fab.process import Process, Variation
+from fab.units import require_kind
 from sim.camera import Camera
 from sim.metrics import metric_rows
 from sim.optic import CellOptic
@@ -33,8 +34,9 @@ def predict(design: Design, process: Process, variation: Variation) -> Predictio
     """Predict the DOE that a design, a process and a variation (its errors, SI units) give.
 
     Raises:
-        InputError: errors beyond what the model describes (`sim.surface.as_fabricated`).
+        InputError: an argument of another kind, or errors beyond what the model describes (`sim.as_fabricated`).
     """
+    require_kind("design", design, Design, "Of a run: dd.open_design(folder).")
     surface = as_fabricated(design.level_map.level, design.camera, process, variation, depths_m=design.depths_m)
     bank = psf(surface, depths=design.depths_m)
     return Prediction(surface, bank, plate_rows(design, surface, bank))

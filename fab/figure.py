@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from fab.aperture import Aperture, MaskAperture
 from fab.files import write_atomic
-from fab.units import MM, format_length
+from fab.units import MM, format_length, require_kind
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,6 +107,7 @@ def panels(
         note: small text below all, wrapped to the width.
         layout: "compressed" for a grid of pictures of fixed aspect.
     """
+    _require_axes(ax)
     with _house_style():
         if ax is None:
             figure = _figure_class()(figsize=size_in, layout=layout)
@@ -130,6 +131,13 @@ def panels(
             engine.execute(root)
 
 
+def _require_axes(ax: object) -> None:
+    if ax is not None:
+        from matplotlib.axes import Axes
+
+        require_kind("ax", ax, Axes, 'Leave it out for a new figure; fab.figure.save(plate.plot(), "x.png") writes it.')
+
+
 def legend_above(figure: "FigureBase", handles: Sequence[Any], title: str) -> None:
     """Put a legend above all panels, under a title: `panels` would write the title over it.
 
@@ -146,6 +154,7 @@ def legend_above(figure: "FigureBase", handles: Sequence[Any], title: str) -> No
 @contextmanager
 def single(ax: "Axes | None", size_in: tuple[float, float], title: str = "", note: str = "") -> "Iterator[Axes]":
     """Open axes for a picture of one panel: those given, whose title `title` becomes, or those of a new figure."""
+    _require_axes(ax)
     if ax is None:
         with panels(None, size_in, title, note) as figure:
             yield figure.subplots()

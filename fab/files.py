@@ -31,11 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.units import named_kind
 
 MANIFEST_NAME = "manifest.json"
 # A field with this mark is left out of records where it is its default, so that records without it stay what they are.
 IF_ANY: Mapping[str, bool] = {"if_any": True}
 
+_NO_FILE = "a pipe, socket or device"
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
@@ -61,6 +63,23 @@ def explain_os_error(error: OSError, path: str | Path) -> InputError:
     return InputError(str(path), rule, f'"{error.strerror or error}"', cure)
 
 
+def path_of(value: object, name: str = "path") -> Path:
+    """Return the path of a file or a folder, given as text or as a path, the value of `name`.
+
+    Raises:
+        InputError: anything else, such as what is to be written there, no text at all, or text that no path may have.
+    """
+    if not isinstance(value, str | os.PathLike) or not str(value) or "\0" in str(value):
+        got = repr(value) if isinstance(value, str) else named_kind(type(value))
+        raise InputError(name, "must be the path of a file or a folder", got, 'For example "out/plate.npz".')
+    return Path(value)
+
+
+def paths_of(value: object, name: str) -> tuple[Path, ...]:
+    """Return the paths of files, of one or of a tuple or list of them, the value of `name`; see `path_of`."""
+    return tuple(path_of(one, name) for one in (value if isinstance(value, tuple | list) else [value]))
+
+
 @contextmanager
 def os_errors_explained(path: str | Path) -> Iterator[None]:
     """Turn every operating-system error within this block into an `InputError` that names the path."""
@@ -80,8 +99,13 @@ def _sync(path: Path) -> None:
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Write a whole file: temporary sibling, fsync, rename; its folder is made if missing."""
-    path = Path(path)
+    """Write a whole file: temporary sibling, fsync, rename; its folder is made if missing.
+
+    Raises:
+        InputError: something else than a path, a device, pipe or socket at that path, or what the system refuses.
+    """
+    path = path_of(path)
+    _require_no_device(path)
     with os_errors_explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         clear_killed(path.parent, path.name.__eq__)
@@ -96,6 +120,18 @@ def write_atomic(path: str | Path, data: bytes) -> None:
             _sync(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def _require_no_device(path: Path) -> None:
+    """Refuse what is no file in the place of one that is to be written: it would be replaced, ``/dev/null`` for all."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # nothing is there, or what the system says of it
+        return
+    # The terminal or pipe of /dev/stdout is a link to what the process has open.
+    stream = path.is_symlink() and os.readlink(path).startswith("/proc/")
+    if stream or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise InputError(str(path), "must be a file, or nothing yet", _NO_FILE, "Give a place for a new file.")
 
 
 def _made_file(path: Path) -> tuple[Path, int]:
@@ -277,7 +313,7 @@ def opened(path: str | Path) -> Iterator[FileIO]:
             if stat.S_ISDIR(mode):
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
             if not stat.S_ISREG(mode):
-                raise InputError(str(path), "must be a file", "a pipe, socket or device", "Copy its content to a file.")
+                raise InputError(str(path), "must be a file", _NO_FILE, "Copy its content to a file.")
             yield stream
 
 

@@ -79,6 +79,8 @@ class Grid:
 
     def axis_m(self, axis: Literal["x", "y"]) -> NDArray[np.float64]:
         """Return the pixel centres along ``"x"`` or ``"y"``, metres: ``(i - (n - 1) / 2) * pitch_m``, ``(n,)``."""
+        if not isinstance(axis, str) or axis not in ("x", "y"):
+            raise InputError("axis", 'must be "x" or "y"', repr(axis), "Choose one of them.")
         n = self.shape[1] if axis == "x" else self.shape[0]
         return (np.arange(n, dtype=np.float64) - (n - 1) / 2) * np.float64(self.pitch_m)
 

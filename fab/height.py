@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fab.aperture import Aperture, MaskAperture, aperture_from
 from fab.aperture.picture import MASK_FILES, read_mask
 from fab.errors import InputError
-from fab.files import read_npy
+from fab.files import path_of, read_npy
 from fab.grid import Grid
 from fab.pictures import TIFF_FILES, read_pixels
 from fab.units import format_length, metres, require_kind
@@ -157,7 +157,7 @@ def read_height(
         InputError: the file is missing, damaged, of another kind or too large, its numbers are no heights
             (`HeightMap`), or pitch or scale is missing.
     """
-    path = Path(path)
+    path = path_of(path)
     if pitch is None:
         raise InputError(str(path), "the pixel pitch must be given", "none", "Give the pitch of a pixel.")
     values = _load(path)

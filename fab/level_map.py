@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fab.aperture import Aperture, MaskAperture, RectangularAperture, RoundAperture, aperture_from, diameter_of
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
-from fab.files import sha256_bytes
+from fab.files import path_of, sha256_bytes
 from fab.grid import Grid
 from fab.height import HeightMap, as_array, require_filled
 from fab.levels import Levels, height_of, level_map_from_planes, planes, quantise, quantise_wrapped, require_levels
@@ -165,6 +165,7 @@ def level_digest(level: NDArray[np.uint8]) -> str:
 
 def write_level_map(path: str | Path, level_map: LevelMap) -> None:
     """Write a level map without loss to `path`; the same `level_map` gives the same bytes. Lengths in it are metres."""
+    path = path_of(path)
     require_kind("level_map", level_map, LevelMap, "A design has one: design.level_map.")
     levels, grid = level_map.levels, level_map.grid
     header = {
@@ -187,7 +188,7 @@ def read_level_map(path: str | Path) -> LevelMap:
     Raises:
         InputError: the file is missing, damaged, changed since it was written, or no level map.
     """
-    path = Path(path)
+    path = path_of(path)
     cure = "Write it again from its run."
     header, arrays = read_archive(path, "level map", cure)
     try:
@@ -206,6 +207,9 @@ def read_level_map(path: str | Path) -> LevelMap:
         relief = aperture_from(aperture, where=f"{path}: aperture_m", shape=grid.shape)
         return LevelMap(level, levels, grid, relief, str(header["name"]))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, InputError):
+        if not isinstance(error, InputError):
+            rule = "must be a level map"
+            raise InputError(str(path), rule, f"{type(error).__name__}: {error}", cure) from error
+        if error.where.startswith(str(path)):
             raise
-        raise InputError(str(path), "must be a level map", f"{type(error).__name__}: {error}", cure) from error
+        raise InputError(f"{path}: {error.where}", error.rule, error.got, cure) from error

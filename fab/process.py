@@ -7,6 +7,7 @@ A `Process` is the recipe: which etches, in which order and how deep, and how la
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from numbers import Integral
 from typing import Literal, NamedTuple
 
 from fab.deviations import (
@@ -23,7 +24,7 @@ from fab.deviations import (
 from fab.errors import InputError
 from fab.files import IF_ANY
 from fab.levels import Levels
-from fab.units import MM, UM, number_of, require_kind
+from fab.units import MM, UM, number_of, numbers_of, require_kind
 
 __all__ = [
     "DEVIATIONS",
@@ -122,26 +123,33 @@ class Process:
     def __post_init__(self) -> None:
         require_kind("process: levels", self.levels, Levels, "Give a fab.Levels(count, step_m).")
         masks = tuple(range(self.levels.bits))
-        order = tuple(self.order) or tuple(sorted(masks, key=self.levels.etch_depth_m))
+        order = numbers_of(self.order) or tuple(sorted(masks, key=self.levels.etch_depth_m))
         if tuple(sorted(order)) != masks:
             rule = f"must name each of the masks 0 to {len(masks) - 1} once"
-            raise InputError("process: order", rule, order, "List every mask.")
+            raise InputError("process: order", rule, self.order, "List every mask.")
         object.__setattr__(self, "order", tuple(int(mask) for mask in order))  # of numpy, they would not go into JSON
         # A copy, and a plain dictionary, because a read-only view of one cannot be sent to another process.
+        require_kind("process: spreads", self.spreads, Mapping, 'For example {"corner_radius_m": fab.Normal(5e-7)}.')
         object.__setattr__(self, "spreads", dict(self.spreads))
         self._check_spreads()
-        if self.tone not in ("clear", "dark"):
+        if not isinstance(self.tone, str) or self.tone not in ("clear", "dark"):
             raise InputError("process: tone", 'must be "clear" or "dark"', self.tone, "Choose one of them.")
         for name in ("minimum_line_m", "minimum_space_m", "wafer_radius_m"):
             if not 0 <= number_of(getattr(self, name)) < math.inf:
                 rule, cure = "must be finite and not negative, in metres", "Give 0 or more, such as 1e-6."
                 raise InputError(f"process: {name}", rule, repr(getattr(self, name)), cure)
             object.__setattr__(self, name, float(getattr(self, name)))  # rules of an order are told as they are kept
-        if self.reduction < 1:
-            raise InputError("process: reduction", "must be 1 or more", self.reduction, "For example 5.")
-        if not math.hypot(*self.die_m) <= self.wafer_radius_m:
-            rule = f"must lie on the wafer of radius {self.wafer_radius_m} m"
-            raise InputError("process: die_m", rule, self.die_m, "Move the die.")
+        if not isinstance(self.reduction, Integral) or isinstance(self.reduction, bool) or self.reduction < 1:
+            rule = "must be a whole number, 1 or more"
+            raise InputError("process: reduction", rule, repr(self.reduction), "For example 5.")
+        self._check_die()
+
+    def _check_die(self) -> None:
+        die_m = numbers_of(self.die_m)
+        if len(die_m) != 2 or not math.hypot(*die_m) <= self.wafer_radius_m:
+            rule = f"must lie on the wafer of radius {self.wafer_radius_m} m, (y, x) in metres from its middle"
+            raise InputError("process: die_m", rule, repr(self.die_m), "Move the die, for example to (0.0, 0.01).")
+        object.__setattr__(self, "die_m", die_m)
 
     def _check_spreads(self) -> None:
         known = error_names(self.masks)

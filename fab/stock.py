@@ -19,6 +19,7 @@ from fab.deviations import Source, Typical, estimate, sourced
 from fab.errors import InputError
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
+from fab.units import require_kind
 
 
 class Figure(NamedTuple):
@@ -90,8 +91,9 @@ def process_from(given: Process | str | None, levels: Levels) -> Process:
     """Return a process for a staircase: the one `given`, the stock process of that name, or by default the ideal one.
 
     Raises:
-        InputError: an unknown name, or a process that makes another staircase than `levels`.
+        InputError: an unknown name, one that makes another staircase than `levels`, or something else than these.
     """
+    require_kind("levels", levels, Levels, "A level map has them: level_map.levels.")
     known = {**STOCK, IDEAL.name: IDEAL}
     if given is None or isinstance(given, Process):
         process = given or Process(levels)

@@ -9,7 +9,7 @@ import math
 import re
 from functools import cache
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def metres(value: float | str, name: str = "length", *, infinite: bool = False) 
     Raises:
         InputError: anything else: text without a unit, a number that is not finite, another type.
     """
-    if infinite and value in (math.inf, "inf"):
+    if infinite and (number_of(value) == math.inf or (isinstance(value, str) and value == "inf")):
         return math.inf
     rule = f'must be metres or text with a unit such as "75 nm"{", or infinite" if infinite else ""}'
     cure = 'Give a number of metres, 75e-9, or text, "75 nm".'
@@ -100,11 +100,51 @@ def number_of(value: object) -> float:
         return math.inf
 
 
+def numbers_of(value: object) -> tuple[float, ...]:
+    """Return the numbers of a tuple, a list or an array ``[n]`` as floats (`number_of`); one NaN for anything else."""
+    several = isinstance(value, tuple | list) or (isinstance(value, np.ndarray) and value.ndim == 1)
+    return tuple(map(number_of, cast(Any, value))) if several else (math.nan,)
+
+
+def distance_from(value: float | str, name: str) -> float:
+    """Return `value`, a positive distance in metres or text with a unit ("5 cm", "inf"), in metres; see `metres`."""
+    distance = metres(value, name, infinite=True)
+    if not distance > 0:
+        raise InputError(name, "must be a positive distance", format_length(distance), 'For example "5 cm", or inf.')
+    return distance
+
+
+def distances_from(value: object, name: str) -> tuple[float, ...]:
+    """Return several positive distances, metres, infinity among them, as floats.
+
+    Args:
+        value: a tuple, a list or an array ``[n]`` of them, perhaps empty.
+        name: what names it in messages.
+
+    Raises:
+        InputError: anything else.
+    """
+    distances = numbers_of(value)
+    if not all(distance > 0 for distance in distances):
+        raise InputError(name, "must be several distances, positive metres", repr(value), "For example (0.05,).")
+    return distances
+
+
+def told_length(value: object) -> str:
+    """Return what was given for a length as messages show it: "75 nm", or what is no number as Python writes it."""
+    number = number_of(value)
+    return repr(value) if math.isnan(number) else format_length(number)
+
+
 def require_kind(name: str, value: object, kind: type, cure: str) -> None:
     """Raise an `InputError` unless a value is of a kind, the value of `name`; `cure` says how to get one."""
     if not isinstance(value, kind):
-        article = "an" if type(value).__name__[0] in "aeiou" else "a"
-        raise InputError(name, f"must be a {kind.__name__}", f"{article} {type(value).__name__}", cure)
+        raise InputError(name, f"must be {named_kind(kind)}", named_kind(type(value)), cure)
+
+
+def named_kind(kind: type) -> str:
+    """Return the name of a kind of value with its article: "an int"."""
+    return f"{'an' if kind.__name__[0] in 'aeiouAEIO' else 'a'} {kind.__name__}"
 
 
 def format_angle(angle_rad: float) -> str:

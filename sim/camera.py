@@ -81,6 +81,13 @@ def _require_length(name: str, value: Any, *, signed: bool = False, infinite: bo
     raise InputError(name, rule, repr(value), "For example 5e-3 for 5 mm.")
 
 
+def require_colour(camera: "Camera", colour: int) -> None:
+    """Raise an `InputError` for what is no number of one of a camera's colours."""
+    if not isinstance(colour, Integral) or isinstance(colour, bool) or not 0 <= colour < len(camera.colours):
+        rule = f"must be the number of a colour, 0 to {len(camera.colours) - 1}"
+        raise InputError("colour", rule, repr(colour), f"They are {', '.join(one.name for one in camera.colours)}.")
+
+
 def require_same_grid(camera: "Camera", grid: Grid) -> None:
     """Raise an InputError unless the DOE of a camera lies on this grid, that of a plate."""
     if camera.grid != grid:
@@ -200,7 +207,7 @@ class Camera:
             raise InputError("grid", "must be the raster of the DOE", type(self.grid).__name__, cure)
         material(self.material)
         colours: Any = self.colours
-        if not isinstance(colours, tuple) or not all(isinstance(one, Colour) for one in colours):
+        if not isinstance(colours, tuple) or not colours or not all(isinstance(one, Colour) for one in colours):
             cure = 'For example (sim.Colour("green", (550e-9,), (1.0,)),).'
             raise InputError("colours", "must be colour channels", repr(colours), cure)
         if not isinstance(self.beam, GaussianBeam | MeasuredBeam | EvenBeam | None):

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fab.errors import InputError
+from fab.units import number_of
 
 
 def _sellmeier(wavelength_um: float, terms: tuple[tuple[float, float], ...]) -> float:
@@ -211,7 +212,13 @@ def fresnel_transmission(index: float) -> float:
 
     One face passes T = 4n/(n+1)^2 (M. Born and E. Wolf, *Principles of Optics*, §1.5); for a substrate much thicker
     than the coherence length the two multiply, and light reflected twice or more counts as lost.
+
+    Raises:
+        InputError: an index that is no number of 1 or more.
     """
+    if not 1 <= number_of(index) < np.inf:
+        cure = 'That of a material is sim.refractive_index("fused_silica", 550e-9).'
+        raise InputError("index", "must be a number of 1 or more", repr(index), cure)
     return (4.0 * index / (index + 1.0) ** 2) ** 2
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Complex, Float
 from fab.errors import InputError
 from fab.height import HeightMap, refuse_where, require_filled
 from fab.level_map import LevelMap
+from fab.units import require_kind
 from sim.aperture import open_cells
 from sim.camera import Camera, SpectralLine, require_same_grid
 from sim.propagation.farfield import FarField, plan_far_field
@@ -315,6 +316,7 @@ class HeightOptic(CellOptic):
 
         Errors are those of `heights_on`.
         """
+        require_kind("camera", camera, Camera, "A design has one: design.camera.")
         # A flat map shares its compiled programs with every other.
         height = heights_on(camera, np.zeros(camera.grid.shape, np.float32) if height_m is None else height_m)
         return cls(camera, jnp.asarray(open_cells(camera.grid, camera.opening)), height)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fab.errors import InputError
-from fab.units import metres, number_of
+from fab.units import metres, number_of, require_kind
 from sim.camera import Camera, SpectralLine
 from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, participation
 from sim.optic import ON_AXIS, CellOptic, Optic, Propagation
@@ -86,6 +86,7 @@ class PsfBank(eqx.Module):
 
     def with_camera(self, camera: Camera) -> "PsfBank":
         """The same PSFs with the camera they were computed for or measured with, which metrics and pictures need."""
+        require_kind("camera", camera, Camera, "A design has one: design.camera.")
         return replace(self, camera=camera)
 
     def metric_inputs(
@@ -187,8 +188,12 @@ class PsfBank(eqx.Module):
         own = self.colours, self.pixel_m, self.camera, self.field_rad, self.sines
         return BankOptic(energy, jnp.asarray(inverse), *own)
 
-    def at(self, depth_m: float) -> Float[np.ndarray, "c y x"] | Float[Array, "c y x"]:
-        """PSFs of every colour at a depth, mixed linearly in 1/z; an InputError for a depth beyond the bank's."""
+    def at(self, depth_m: float | str) -> Float[np.ndarray, "c y x"] | Float[Array, "c y x"]:
+        """PSFs of every colour at a depth, metres or with a unit ("5 cm", "inf"), mixed linearly in 1/z.
+
+        An InputError for a depth beyond the bank's.
+        """
+        depth_m = metres(depth_m, "depth", infinite=True)
         order = np.argsort([1 / depth for depth in self.depths_m])
         curvatures = np.array([1 / self.depths_m[d] for d in order])
         # The slack lets a depth through that was rounded on its way; it is far below any change of a PSF.

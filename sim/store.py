@@ -30,8 +30,10 @@ from jaxtyping import Float
 
 from fab.aperture import Aperture, MaskAperture, aperture_from
 from fab.errors import InputError
-from fab.files import canonical_json, read_bytes, write_atomic
+from fab.files import canonical_json, path_of, read_bytes, write_atomic
+from fab.height import as_array
 from fab.pictures import MOST_PER_BYTE
+from fab.units import number_of, require_kind
 
 if TYPE_CHECKING:
     import sim.psf_bank
@@ -84,12 +86,21 @@ def write_height(
         pitch_m: cell pitch, metres.
         aperture: the clear aperture; a number is the diameter of a round one, metres.
         extra: further text attributes; a ValueError for a name that is taken.
+
+    Raises:
+        InputError: heights that are no map, a pitch or an aperture that is no positive length, or no path.
     """
-    outline = aperture_from(aperture)
+    outline, heights = aperture_from(aperture), as_array(height_m, "height_m")
+    if heights.ndim != 2:
+        raise InputError("height_m", "must be a map [y, x]", f"the shape {heights.shape}", "Give heights in metres.")
+    if not outline.narrowest_m > 0:
+        raise InputError("aperture", "must be positive", str(outline), "Give the diameter in metres.")
+    if not 0 < number_of(pitch_m) < np.inf:
+        raise InputError("pitch_m", "must be a positive number of metres", repr(pitch_m), "For example 2e-6 for 2 um.")
     sizes = " x ".join(map(repr, map(float, outline.sizes_m)))
     text = canonical_json(outline.record()).decode() if isinstance(outline, MaskAperture) else sizes
     texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": text}
-    _write(Path(path), {"height": height_m}, texts, extra)
+    _write(path_of(path), {"height": heights}, texts, extra)
 
 
 def read_height(path: str | Path) -> StoredHeight:
@@ -101,7 +112,8 @@ def read_height(path: str | Path) -> StoredHeight:
     Raises:
         InputError: no such file, or heights that are not finite and at least 0.
     """
-    channels, texts = _read(Path(path))
+    path = path_of(path)
+    channels, texts = _read(path)
     if "height" not in channels:
         rule = "a height map must have a channel named height, in metres"
         got = f"the channels {', '.join(sorted(channels))}"
@@ -143,8 +155,13 @@ def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[st
         extra: further text attributes.
 
     Raises:
+        InputError: no PSF bank, or no path.
         ValueError: two depths or colours have the same name, or the name of an attribute is taken.
     """
+    from sim.psf_bank import PsfBank
+
+    require_kind("bank", bank, PsfBank, "For example sim.psf(design).")
+    path = path_of(path)
     channels = {
         _channel_name(depth, colour): bank.energy[c, d]
         for c, colour in enumerate(bank.colours)
@@ -158,7 +175,7 @@ def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[st
         _pixel_key(bank): repr(float(bank.pixel_m)),
         "field_rad": [repr(float(angle)) for angle in bank.field_rad],
     }
-    _write(Path(path), channels, {_BANK: canonical_json(description).decode()}, extra)
+    _write(path, channels, {_BANK: canonical_json(description).decode()}, extra)
 
 
 def _pixel_key(bank: "sim.psf_bank.PsfBank") -> str:
@@ -178,11 +195,16 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         the bank; a measured PSF has the colours R, G, B or the name of its one channel, and its own scale.
 
     Raises:
-        InputError: no whole EXR file with finite values, or a pixel pitch that is missing or contradicts the file.
+        InputError: no whole EXR file with finite values, a pixel pitch that is missing or contradicts the file, or a
+            depth that is no positive length.
     """
     from sim.psf_bank import PsfBank
 
-    channels, texts = _read_psfs(path)
+    if not number_of(depth_m) > 0:
+        raise InputError("depth_m", "must be a positive number of metres", repr(depth_m), "For example 0.05, or inf.")
+    if pixel_m is not None and not 0 < number_of(pixel_m) < np.inf:
+        raise InputError("pixel_m", "must be a positive number of metres", repr(pixel_m), "For example 2e-6 for 2 um.")
+    channels, texts = _read_psfs(path_of(path))
     if _BANK not in texts:
         colours = _measured_colours(path, channels)
         if pixel_m is None:

@@ -11,6 +11,7 @@ seem to resolve nothing at the sensor's own limit.
 import math
 from dataclasses import dataclass
 from itertools import product
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fab.errors import InputError
 from sim.camera import Camera, SpectralLine
 from sim.metrics import near_and_far
 from sim.optic import ON_AXIS, CellOptic
@@ -94,8 +96,11 @@ def mtf(
             sines.
 
     Raises:
+        InputError: a count of frequencies below 2.
         TypeError: an optic that is not made of cells.
     """
+    if not isinstance(count, Integral) or isinstance(count, bool) or count < 2:
+        raise InputError("count", "must be a whole number of frequencies, 2 or more", repr(count), "For example 160.")
     depths_m = depths_from(depths)
     doe = optic_of(optic, camera, depths_m)
     if not isinstance(doe, CellOptic):

@@ -16,9 +16,9 @@ from doedesign.design.design import Design
 from doedesign.design.given_wave import WaveShare
 from doedesign.spec import input_files
 from doedesign.spec.targets.areas import WITHIN_THE_AREA
-from fab.units import MICROMETRES, MILLIMETRES, PlaceUnit, format_length
-from sim.camera import Camera
-from sim.metrics import zeroth_order
+from fab.units import MICROMETRES, MILLIMETRES, PlaceUnit, format_length, require_kind
+from sim.camera import Camera, require_colour
+from sim.metrics import cells_of, zeroth_order
 from sim.optic import CellOptic
 
 if TYPE_CHECKING:
@@ -320,14 +320,21 @@ def targets_of_design(design: Design) -> tuple[AreaTarget, ...]:
     return tuple(targets)
 
 
-def area_table(doe: CellOptic, target: AreaTarget, colour: int = 0) -> AreaTable:
+def area_table(doe: Any, target: AreaTarget, colour: int = 0) -> AreaTable:
     """Look at the area of a DOE, in the light of a colour's first wavelength.
 
     Args:
-        doe: the DOE: as drawn, as fabricated, with or without the light of its walls.
+        doe: the DOE: a design, or an optic of cells, as drawn, as fabricated, with or without the light of its walls.
         target: the area, on a lattice as fine as its light is to be seen.
         colour: number of the colour.
+
+    Raises:
+        InputError: an argument of another kind, or a colour that the camera does not have.
     """
+    doe = cells_of("doe", doe)
+    cure = "For example dd.AreaTarget.of(area, camera); areas of a spec are in dd.fabricated(design, seed=0).aimed."
+    require_kind("target", target, AreaTarget, cure)
+    require_colour(doe.camera, colour)
     camera = replace(doe.camera, colours=(doe.camera.colours[colour],))
     fields, score = _fields_on(doe, target, colour), AreaScore.of(target)
     light, wave = _light_of(fields), target.wave

@@ -30,6 +30,7 @@ from doedesign.runs.results import results_folder
 from doedesign.runtime.progress import meter
 from fab.errors import InputError
 from fab.figure import html_of
+from fab.files import path_of
 from fab.process import Normal, Process
 from sim.camera import Colour
 
@@ -165,7 +166,7 @@ def calibrate(
     corner_m = float(np.hypot(*grid.extent_m)) / 2
     unknowns = unknowns_of(prior, errors, grid.pitch_m, corner_m)  # refuses mistakes before files are read
     if not isinstance(measurement, Measurement):
-        measurement = read_measurement(Path(measurement), design.camera)
+        measurement = read_measurement(path_of(measurement, "measurement"), design.camera)
     if design.camera.beam is not None:
         log.warning("the plate is lit as the measurement says (mode_field), not by the beam of the design")
     about = {"level_map_sha256": design.level_map.digest, "light": design.camera.light}

@@ -38,6 +38,7 @@ from doedesign.runs.results import results_folder
 from fab.errors import InputError
 from fab.figure import html_of
 from fab.process import Normal, Process, deviation_of, variation_of
+from fab.units import number_of
 from sim.camera import Colour
 
 if TYPE_CHECKING:
@@ -328,14 +329,14 @@ def _require_possible(targets: Targets, reach: float) -> None:
         ("depth", targets.depth_m, 'For example "10 cm".'),
         ("throughput_sigma", targets.throughput_sigma, "For example 0.02."),
     ):
-        if not value > 0:
-            raise InputError(name, positive, value, cure)
-    if not 0 < targets.ring_to_disc < np.inf:
-        raise InputError("ring_to_disc", positive, targets.ring_to_disc, "Give ring energy over disc energy.")
-    if targets.throughput is not None and not 0 < targets.throughput <= 1:
+        if not number_of(value) > 0:
+            raise InputError(name, positive, repr(value), cure)
+    if not 0 < number_of(targets.ring_to_disc) < np.inf:
+        raise InputError("ring_to_disc", positive, repr(targets.ring_to_disc), "Give ring energy over disc energy.")
+    if targets.throughput is not None and not 0 < number_of(targets.throughput) <= 1:
         rule = "must be a share of the light, above 0 and up to 1"
-        raise InputError("throughput", rule, targets.throughput, "Write 0.86.")
-    if not 0 < reach <= _MOST_REACH:
+        raise InputError("throughput", rule, repr(targets.throughput), "Write 0.86.")
+    if not 0 < number_of(reach) <= _MOST_REACH:
         raise InputError("reach", f"must be above 0 and up to {_MOST_REACH}", reach, "For example 4.")
 
 

@@ -22,6 +22,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,12 +47,14 @@ from fab.files import (
     atomic_folder,
     canonical_json,
     clear_killed,
+    path_of,
     read_json,
     sha256_bytes,
     sha256_file,
     write_atomic,
 )
 from fab.process import Process, Variation
+from fab.units import require_kind
 from sim.imaging.occlusion import follows_light
 from sim.rigorous.edge_optic import optic_as_drawn
 from sim.surface import as_fabricated
@@ -82,8 +85,8 @@ class SimulationResult(NamedTuple):
 
 def simulate_files(
     design: Design,
-    folder: Path,
-    images: Path | None = None,
+    folder: str | Path,
+    images: str | Path | None = None,
     *,
     obstruction: str | None = None,
     occlusion: str | None = None,
@@ -110,13 +113,22 @@ def simulate_files(
     Raises:
         InputError: the folder is that of something else, or a picture, name or number cannot be used.
     """
-    assert design.spec is not None
+    require_kind("design", design, Design, "Of a run: dd.open_design(folder).")
+    if design.spec is None:
+        rule, cure = (
+            "must have a spec, which says what is photographed",
+            "Of one picture: dd.simulate(picture, design).",
+        )
+        raise InputError("design", rule, "none", cure)
+    folder, images = path_of(folder, "folder"), None if images is None else path_of(images, "images")
     kind, model, view, far_m = Stage.of(design, obstruction, occlusion, size)
     pictures = Pictures(picture_files(images), most_px=2 * max(view.shape))
     count = min(_USUAL_COUNT, len(pictures)) if count is None else count
     require_seed(seed)
-    if count < 1:
-        raise InputError("count", "must be at least 1", count, "Leave it out for one item per picture, at most six.")
+    if not isinstance(count, Integral) or isinstance(count, bool) or count < 1:
+        raise InputError(
+            "count", "must be at least 1", repr(count), "Leave it out for one item per picture, at most six."
+        )
     data = SceneData(pictures, kind, view, far_m, seed, mirrored=False)
     words = "plate as drawn" if plate is None else f"plate with {plate.words}"
     settings = {

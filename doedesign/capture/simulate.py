@@ -125,7 +125,7 @@ def simulate(
     picture: str | Path | np.ndarray,
     design: "Design | Run | str | Path",
     *,
-    obstruction: str | ObstructionKind | None = None,
+    obstruction: str | Path | ObstructionKind | None = None,
     occlusion: str | None = None,
     seed: int = 0,
     size: int | None = None,
@@ -175,14 +175,18 @@ class Stage(NamedTuple):
 
     @classmethod
     def of(
-        cls, design: Design, obstruction: str | ObstructionKind | None, occlusion: str | None, size: int | None
+        cls, design: Design, obstruction: str | Path | ObstructionKind | None, occlusion: str | None, size: int | None
     ) -> "Stage":
         """Take all that is not given from the design's spec; see `simulate`."""
         spec, source = design.spec, str((design.folder or Path()) / "spec.toml")
         chosen = occlusion_from_spec(spec, source, occlusion)
-        if obstruction is None or isinstance(obstruction, str):
-            kind = obstruction_from_spec(spec, source, obstruction, design.near_m)
+        if obstruction is None or isinstance(obstruction, str | Path):
+            name = obstruction if obstruction is None else str(obstruction)
+            kind = obstruction_from_spec(spec, source, name, design.near_m)
         else:
+            if not hasattr(obstruction, "draw"):
+                rule, cure = "must be a kind of obstruction, its name, or a folder of masks", "For example sim.Dirt()."
+                raise InputError("obstruction", rule, repr(obstruction), cure)
             kind = obstruction
         camera = replace(design.camera, window=design.camera.window | 1)  # odd: the capture lies on the scene
         side = _side(spec, size)

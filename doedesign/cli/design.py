@@ -37,7 +37,8 @@ def new(name: str | None = None, *, out: Path | None = None, json_: AsJson = Fal
         return
     text, path = template_text(name), out or Path(f"{name}.toml")
     if path.exists():
-        raise InputError(str(path), "a new spec must not replace a file", "a file of that name", "Give another --out.")
+        got = "a folder" if path.is_dir() else "a file of that name"
+        raise InputError(str(path), "a new spec must not replace a file", got, "Give another --out.")
     write_atomic(path, text.encode())
     print_paths([path], json_)
     say(f"next: doedesign {shlex.join(['optimize', str(path)])}")

@@ -17,7 +17,7 @@ from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Process, Variation
-from fab.units import format_length, metres, number_of, require_kind
+from fab.units import distances_from, format_length, metres, require_kind
 from sim.camera import Camera, require_same_grid
 
 if TYPE_CHECKING:
@@ -75,13 +75,7 @@ class Design:
         require_kind("camera", self.camera, Camera, "Give lens, sensor and substrate, a sim.Camera.")
         require_same_grid(self.camera, self.level_map.grid)
         for name in ("near_m", "far_m"):
-            given: Any = getattr(self, name)
-            distances = tuple(given) if isinstance(given, tuple | list | np.ndarray) else (math.nan,)
-            if not all(number_of(distance) > 0 for distance in distances):
-                raise InputError(
-                    name, "must be several distances, positive metres", repr(given), "For example (0.05,)."
-                )
-            object.__setattr__(self, name, distances)
+            object.__setattr__(self, name, distances_from(getattr(self, name), name))
 
     @property
     def name(self) -> str:

@@ -31,6 +31,7 @@ from doedesign.spec.models import ObjectiveSpec
 from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
 from fab.files import sha256_file
+from fab.units import require_kind
 from sim.aperture import open_shares
 from sim.camera import Camera
 from sim.imaging.filtering import filter_errors, photograph_spectrum, transfers
@@ -322,8 +323,9 @@ def import_objectives(spec: Spec) -> dict[str, Objective]:
     """Import the objectives of the user's own that a spec names `module:function`: this runs code that it names.
 
     Raises:
-        InputError: no such module or function, or a module that fails when it is imported.
+        InputError: no spec, no such module or function, or a module that fails when it is imported.
     """
+    require_kind("spec", spec, Spec, 'Read it by dd.load_spec("spec.toml").')
     named = {f"objective[{i}]": one.name for i, one in enumerate(spec.objectives) if one.name not in BUILT_IN}
     return {name: _imported(name, where) for where, name in named.items()}
 

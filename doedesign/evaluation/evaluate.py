@@ -45,7 +45,7 @@ from doedesign.runtime.stopping import stoppable
 from doedesign.spec import spec_digest
 from doedesign.training.distance.perceptual import Lpips, read_lpips
 from fab.errors import InputError
-from fab.files import canonical_json, read_bytes, sha256_bytes, sha256_file, write_atomic
+from fab.files import canonical_json, path_of, read_bytes, sha256_bytes, sha256_file, write_atomic
 from fab.process import Process
 from sim.camera import Camera
 from sim.imaging.convolve import Border
@@ -128,13 +128,13 @@ def evaluate(
     if robust is not None and table == 1:
         raise InputError("robust", "has rows in table 2 alone", robust, "Leave it out, or choose table 2.")
     require_seed(seed)
-    run, programs = Path(source), [ExternalMethod.parse(text) for text in methods]
-    folder = run / "evaluation" if out is None else Path(out)
+    run, programs = path_of(source, "source"), [ExternalMethod.parse(text) for text in methods]
+    folder = run / "evaluation" if out is None else path_of(out, "out")
     with stoppable():
         design = open_design(run, False, overrides=overrides, free=TRAINING_TABLES)
         assert design.spec is not None  # every run has one
         if robust is not None:  # said before hours of training
-            _require_same_camera(design, open_design(Path(robust), False), Path(robust))
+            _require_same_camera(design, open_design(robust, False), path_of(robust, "robust"))
         given = _sources(folder, images, test, licence)
         if train:  # said before hours of it
             _require_apart(given.images, given.test)
@@ -158,7 +158,7 @@ def evaluate(
             images=given.images,
             validation=given.test,
             licence=given.licence,
-            robust=None if robust is None else Path(robust),
+            robust=None if robust is None else path_of(robust, "robust"),
             lpips_weights=tuple(lpips_weights),
         )
         looked_at = (*chosen, *_looked_through(programs))
@@ -234,8 +234,8 @@ def _sources(folder: Path, images: str | Path | None, test: str | Path | None, l
         rule = "pictures to judge by must come from a folder of their own"
         raise InputError("test", rule, "none", "Give a folder of pictures that are not trained on.")
     if images is not None and test is not None:
-        _require_apart(Path(images), Path(test))
-        return Sources(Path(images), Path(test), licence)
+        _require_apart(path_of(images, "images"), path_of(test, "test"))
+        return Sources(path_of(images, "images"), path_of(test, "test"), licence)
     homes = folder / "pictures" / "trained_on", folder / "pictures" / "judged_by"
     samples = sample_files()
     for home, files in zip(homes, ([p for k, p in enumerate(samples) if k % 3], samples[::3]), strict=True):

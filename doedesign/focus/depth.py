@@ -12,8 +12,9 @@ from jaxtyping import Float
 from doedesign.design.design import Design
 from doedesign.focus.foci import Foci
 from doedesign.focus.problem import BESIDE, focus_light
+from fab.units import require_kind
 from sim.camera import Camera
-from sim.metrics import zeroth_order
+from sim.metrics import cells_of, zeroth_order
 from sim.optic import CellOptic
 from sim.propagation.near_axis import profiles
 
@@ -146,13 +147,19 @@ def focus_of_design(design: Design, doe: CellOptic) -> FocusTable:
     return focus_table(doe, Foci.shown(design.spec.focus, design.camera))
 
 
-def focus_table(doe: CellOptic, foci: Foci) -> FocusTable:
+def focus_table(doe: Any, foci: Foci) -> FocusTable:
     """Look at the foci of a DOE without a lens.
 
     Args:
-        doe: the DOE: as drawn, as fabricated, with or without the light of its walls.
+        doe: the DOE: a design, or an optic of cells, as drawn, as fabricated, with or without the light of its walls.
         foci: where to look.
+
+    Raises:
+        InputError: an argument of another kind.
     """
+    doe = cells_of("doe", doe)
+    cure = "For example dd.Foci(distance_m, width_m, weight, colour); those of a spec: dd.fabricated(design).aimed."
+    require_kind("foci", foci, Foci, cure)
     camera = doe.camera
     light, strength, share = [], [], []
     for distance, width, colour in zip(foci.distance_m, foci.width_m, foci.colour, strict=True):

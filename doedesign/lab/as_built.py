@@ -21,7 +21,7 @@ from doedesign.runs.results import results_folder
 from doedesign.spec import variation_to_toml
 from fab.errors import InputError
 from fab.figure import save
-from fab.files import canonical_json, sha256_file
+from fab.files import canonical_json, path_of, sha256_file
 from fab.process import Normal, Process, Variation, deviation_of, error_names, variation_of
 from fab.runsheet.as_built import AsBuilt, MaskMeasured, read_as_built
 from fab.runsheet.tables import PredictedMetrics
@@ -267,7 +267,7 @@ def as_built(
     """
     design = open_design(source, masks)
     made_by = resolve_process(process, design.levels, design.spec and design.spec.process)
-    measured = read_as_built(Path(file), design.level_map)
+    measured = read_as_built(path_of(file, "file"), design.level_map)
     doe = as_built_doe(measured, made_by)
     count = Counter(one.source for one in doe.taken)
     sources = [each for each in ("measured", "process mean", "not measured, taken as 0") if count[each]]

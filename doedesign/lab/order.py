@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from doedesign.build import (
-    camera_from_spec,
     is_process_file,
     process_from_spec,
     resolve_process,
@@ -17,11 +16,12 @@ from doedesign.design.design import Design
 from doedesign.lab.predictions import PROBE_M, predict_sheet
 from doedesign.prediction import predict
 from doedesign.runs.folder import Run
-from doedesign.runs.level_maps import drawing_from
+from doedesign.runs.level_maps import GEOMETRY, drawing_from
 from doedesign.runs.orders import place_of_order, require_replaceable
 from doedesign.runs.verdict import certified_orders
 from doedesign.spec import OrderSpec, ProcessSpec, WaferSpec, load_order, load_process, load_wafer
 from fab.errors import InputError
+from fab.files import path_of
 from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
@@ -79,17 +79,21 @@ def write_masks(
             (`doedesign.runs.level_maps.drawing_from`).
 
     Raises:
-        InputError: the probe's wavelength is not positive, the map cannot be drawn, the process cannot print it and
-            `on_violation` is "fail", or the folder cannot be written or has the order of another design.
+        InputError: an argument that there is not, the probe's wavelength is not positive, the map cannot be drawn, the
+            process cannot print it and `on_violation` is "fail", or the folder cannot be written or has the order of
+            another design.
         CheckFailed: what was read back differs from what was asked for; nothing is left behind.
     """
     probe_m = metres(probe_m, "probe_m")
     if not probe_m > 0:
         raise InputError("probe_m", "must be positive", f"{probe_m:g} m", 'Give a wavelength, such as "520 nm".')
+    if unknown := [name for name in geometry if name not in GEOMETRY]:
+        rule, cure = "must be an argument that there is", f"Those of a bare height map are {', '.join(GEOMETRY)}."
+        raise InputError(unknown[0], rule, repr(geometry[unknown[0]]), cure)
     level_map, origin, design = drawing_from(source, levels, **geometry)
     spec = None if design is None else design.spec
     run = None if design is None else design.folder
-    folder = place_of_order(level_map, origin, run) if out is None else Path(out)
+    folder = place_of_order(level_map, origin, run) if out is None else path_of(out, "out")
     if not overwrite:  # said before anything takes time
         require_replaceable(folder, level_map, origin, run)
     made_by = _process(process, level_map.levels, spec and spec.process)
@@ -112,7 +116,7 @@ def write_masks(
         direct_write=direct_write,
         source=origin,
         on_violation=on_violation,
-        waves_per_metre=spec and camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m),
+        waves_per_metre=design and design.camera.waves_per_metre(_design_wavelength_m(design)),
         papers=True,
         formats=formats,
         material=made_of,
@@ -129,10 +133,9 @@ def write_masks(
         if design is None:
             return None
         drawn = replace(design, level_map=order.level_map)
-        design_m = spec.optics.design_wavelength_m if spec else mean_wavelength_m(design.camera.colours[0])
         moves_m = [move * order.dbu_m for move in order.edge_moves()]
         try:
-            seen = predict_sheet(drawn, order.process, design_m, probe_m, moves_m)
+            seen = predict_sheet(drawn, order.process, _design_wavelength_m(design), probe_m, moves_m)
         except InputError as error:
             if isinstance(error.__cause__, OSError):
                 raise  # a full disk is no limit of the model
@@ -151,6 +154,11 @@ def drawn_as(order: WrittenOrder) -> str:
     if "rounded" in source:
         return f"as rounded to {count} levels, not as designed with {source['rounded']['designed_levels']}"
     return f"as the map rounded to {count} levels" if source.get("kind") == "height map" else "as designed"
+
+
+def _design_wavelength_m(design: Design) -> float:
+    """The wavelength that a design is for, metres: that of its spec, or of its first colour."""
+    return design.spec.optics.design_wavelength_m if design.spec else mean_wavelength_m(design.camera.colours[0])
 
 
 def _process(given: Process | str | Path | None, levels: Levels, usual: ProcessSpec | None) -> Process:

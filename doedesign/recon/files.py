@@ -16,13 +16,23 @@ from typing import Any
 import numpy as np
 
 from doedesign.recon.model import Model, PsfPair
-from doedesign.recon.photos import WRITTEN_FILES, Photo, read_capture, write_reconstruction
+from doedesign.recon.photos import WRITTEN_FILES, Photo, read_capture, require_capture, write_reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, plan_tiles
 from doedesign.runs.folder import alone_in
 from doedesign.runtime.progress import meter
 from fab.errors import InputError
 from fab.figure import length_text
-from fab.files import MANIFEST_NAME, canonical_json, read_json, real_path, sha256_file, write_atomic
+from fab.files import (
+    MANIFEST_NAME,
+    canonical_json,
+    path_of,
+    paths_of,
+    read_json,
+    real_path,
+    sha256_file,
+    write_atomic,
+)
+from fab.units import require_kind
 
 FORMAT = "doedesign reconstructions 1"
 
@@ -31,8 +41,8 @@ _log = logging.getLogger("doedesign")
 
 def reconstruct_files(
     model: Model,
-    captures: Sequence[Path],
-    folder: Path,
+    captures: str | Path | Sequence[str | Path],
+    folder: str | Path,
     *,
     psfs: PsfPair | None = None,
     linear: bool | None = None,
@@ -45,7 +55,7 @@ def reconstruct_files(
 
     Args:
         model: the model.
-        captures: files (`doedesign.recon.photos`).
+        captures: one file or several (`doedesign.recon.photos`).
         folder: where to; a new or empty folder, or one of earlier reconstructions.
         psfs: PSFs to give to the network; the model's own if None.
         linear: whether PNG and TIFF hold linear light; by default what is usual for their kind.
@@ -57,6 +67,10 @@ def reconstruct_files(
     Raises:
         InputError: a capture or number that cannot be used, or a folder that holds something else.
     """
+    require_kind("model", model, Model, 'Open one by dd.Model.open("runs/NAME/trained").')
+    captures, folder = paths_of(captures, "captures"), path_of(folder, "folder")
+    for capture in captures:  # said before a folder is made, and before those ahead of it take their time
+        require_capture(capture)
     names = [_with_beside(name, beside) for name in _names(captures, kind)]
     _require_own_folder(folder, captures, [name for each in names for name in each])
     multiple = model.network.layout.multiple

@@ -28,7 +28,8 @@ from doedesign.recon.reconstruction import Reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, reconstruct_tiled
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
 from fab.errors import InputError
-from fab.files import sha256_file
+from fab.files import path_of, paths_of, sha256_file
+from fab.units import distance_from
 from sim.metrics import mean_wavelength_m
 from sim.psf_bank import PsfBank
 from sim.store import is_own_bank, read_bank
@@ -111,7 +112,7 @@ class Model:
         Raises:
             InputError: files that are missing, broken, or do not belong together.
         """
-        places = (Path(folder) / "trained", Path(folder))
+        places = (path_of(folder, "folder") / "trained", Path(folder))
         home = next((place for place in places if (place / NETWORK_NAME).is_file()), None)
         if home is None:
             cure = "Train one (`doedesign.train`), or give the folder of a released model."
@@ -155,11 +156,11 @@ class Model:
 
     def psfs(
         self,
-        files: Sequence[Path] = (),
+        files: str | Path | Sequence[str | Path] = (),
         *,
         pixel_m: float | None = None,
-        near_m: float | None = None,
-        far_m: float | None = None,
+        near_m: float | str | None = None,
+        far_m: float | str | None = None,
     ) -> PsfPair:
         """PSFs of the scene and of the obstruction, the model's own or those of files.
 
@@ -167,8 +168,9 @@ class Model:
             files: one bank, or two files, of the scene and of the obstruction. A file of another program (channels R,
                 G, B, or one) is taken as measured, and scaled to the energy of the model's own PSF.
             pixel_m: pixel pitch of measured PSFs, metres; only with files.
-            near_m: distance of the obstruction; the middle, in 1/z, of what the network was trained on if None.
-            far_m: distance of the scene; if None what the network was trained for, or the farthest of the PSFs where it
+            near_m: distance of the obstruction, metres or with a unit; if None the middle, in 1/z, of what the network
+                was trained on.
+            far_m: the same of the scene; if None what the network was trained for, or the farthest of the PSFs where it
                 does not say that or they have none of it.
 
         Raises:
@@ -177,23 +179,25 @@ class Model:
         if pixel_m is not None and not files:
             rule, cure = "goes with PSFs of another program", "Give their files, too, or leave it out."
             raise InputError("pixel_m", rule, "the model's own PSFs", cure)
-        near_m = middle_depth_m(self.near_m) if near_m is None else near_m
-        if not files:
+        near_m = middle_depth_m(self.near_m) if near_m is None else distance_from(near_m, "near_m")
+        far_m = far_m if far_m is None else distance_from(far_m, "far_m")
+        paths = list(paths_of(files, "files"))
+        if not paths:
             own_m = self._usual_far_m(self.bank) if far_m is None else far_m
             return _pair(self.bank, self.bank, own_m, near_m)
-        if len(files) > 2:
+        if len(paths) > 2:
             rule = "must be one bank, or one file of the scene and one of the obstruction"
-            raise InputError("psf", rule, f"{len(files)} files", "Give one or two.")
+            raise InputError("psf", rule, f"{len(paths)} files", "Give one or two.")
         usual = self._usual_far_m(self.bank) if far_m is None else far_m
         banks = [
             self._fitted(read_bank(path, pixel_m, depth), path, depth)
-            for path, depth in zip(files, (usual, near_m), strict=False)
+            for path, depth in zip(paths, (usual, near_m), strict=False)
         ]
         if len(banks) == 1 and len(banks[0].depths_m) == 1:
             rule = "PSFs of the scene and of the obstruction are needed"
-            raise InputError(str(files[0]), rule, "one depth", "Give two files, first that of the scene.")
+            raise InputError(str(paths[0]), rule, "one depth", "Give two files, first that of the scene.")
         far_m = self._usual_far_m(banks[0]) if far_m is None else far_m
-        digests = {path.name: sha256_file(path) for path in files}
+        digests = {path.name: sha256_file(path) for path in paths}
         return _pair(banks[0], banks[-1], far_m, near_m)._replace(digests=digests)
 
     def _usual_far_m(self, bank: PsfBank) -> float:

@@ -20,7 +20,7 @@ from jaxtyping import Float, Num
 
 from doedesign.capture.image_files import read_image
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, read_json, sha256_file
+from fab.files import MANIFEST_NAME, opened, path_of, read_json, sha256_file
 from fab.pictures import read_pixels, write_pixels
 from sim.frames import RAW_FILES, open_raw
 from sim.light import linear_from_srgb
@@ -59,10 +59,8 @@ def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
             values that are not finite; or rawpy is not installed.
     """
     path = Path(path)
+    require_capture(path)
     suffix = path.suffix.lower()
-    if suffix not in PHOTO_FILES:
-        rule, cure = f"a capture must be one of {', '.join(PHOTO_FILES)}", "Convert it without loss first."
-        raise InputError(str(path), rule, suffix or "no suffix", cure)
     stored = _described(path) if suffix in (".png", ".exr") else None
     if suffix == ".exr":
         return finite(Photo(_exr_light(path), None, True, str(path)))
@@ -71,6 +69,16 @@ def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
     if suffix in RAW_FILES:
         return finite(Photo(_raw_light(path), 16, True, str(path)))
     return photo_from_array(read_pixels(path), linear, str(path))
+
+
+def require_capture(path: Path) -> None:
+    """Raise an `InputError` for a file that is missing or, by its ending, no capture, before any is worked on."""
+    suffix = path.suffix.lower()
+    if suffix not in PHOTO_FILES:
+        rule, cure = f"a capture must be one of {', '.join(PHOTO_FILES)}", "Convert it without loss first."
+        raise InputError(str(path), rule, suffix or "no suffix", cure)
+    with opened(path):
+        pass
 
 
 def finite(photo: Photo) -> Photo:
@@ -92,7 +100,7 @@ def write_reconstruction(path: str | Path, display: Float[np.ndarray, "c y x"], 
         InputError: another ending, or the system refuses the path.
         ValueError: PNG cannot hold floats, or another number of bits.
     """
-    path = Path(path)
+    path = path_of(path)
     suffix = path.suffix.lower()
     if suffix not in WRITTEN_FILES:
         rule = f"a picture must be one of {', '.join(WRITTEN_FILES)}"
@@ -153,6 +161,7 @@ def photo_from_array(values: Num[np.ndarray, "..."], linear: bool | None = None,
     Raises:
         InputError: another shape or another type, or values that are not finite.
     """
+    values = np.asarray(values)
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (1, 3)):
         rule, got = "must be one picture, grey or in red, green and blue", f"pixels of shape {values.shape}"
         raise InputError(name, rule, got, _CURE)

@@ -24,6 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fab.units import number_of
+
 TILE, OVERLAP = 1536, 256
 
 # A network, or anything that is called like one: from `[b, c, y, x]` capture, far and near PSFs to display values.
@@ -53,7 +55,7 @@ def plan_tiles(shape: tuple[int, int], tile: int = TILE, overlap: int = OVERLAP,
         ValueError: a tile or an overlap that is no such multiple, or an overlap of more than half a tile.
     """
     for name, value in (("tile", tile), ("overlap", overlap)):
-        if value < multiple or value % multiple:
+        if not number_of(value) >= multiple or value % multiple:
             raise ValueError(f"`{name}` must be a multiple of {multiple}, but got {value}")
     if 2 * overlap > tile:
         raise ValueError(f"`overlap` must be at most half of the tile of {tile}, but got {overlap}")

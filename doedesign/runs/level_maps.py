@@ -1,6 +1,7 @@
 """Level maps and designs from a run, its mask files, or a height map of the user's own."""
 
 import logging
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from doedesign.runs.orders import own_order, require_order_of
 from doedesign.spec import HEIGHT_FILES
 from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
-from fab.files import sha256_file
+from fab.files import path_of, sha256_file
 from fab.grid import Grid
 from fab.height import HeightMap, outline_of, read_height
 from fab.layout.geometry import pixel_edges
@@ -102,6 +103,10 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
     return LevelMap.from_height(height, levels, run.spec.name, wrapped=True)
 
 
+# What a bare height map needs to be drawn (`drawing_from`).
+GEOMETRY = ("step_m", "etch_depths_m", "pitch_m", "scale_m", "aperture_m")
+
+
 def require_source(name: str, source: object) -> None:
     """Raise an InputError for what is no design, run or path; a plate of one's own is made a design first."""
     if not isinstance(source, Design | Run | str | Path):
@@ -140,7 +145,7 @@ def open_design(
     require_source("design", source)
     run = run_of(source)
     level_map = level_map_of_run(run, levels)
-    folder = Path(masks) if masks else None
+    folder = path_of(masks, "masks") if masks else None
     if masks is None and levels is None:
         folder = own_order(run.spec.name, run.folder, level_map)
     redrawn = levels not in (None, levels_from_spec(run.spec.process).count)
@@ -233,8 +238,7 @@ def drawing_from(
     levels = Levels(count, step_m, tuple(etch_depths_m))
     relief = aperture_m if aperture_m is None or isinstance(aperture_m, str) else aperture_from(aperture_m)
     height = read_any_height(source, pitch_m, scale_m, relief)
-    # Mask shops take ASCII names; a name of other letters alone leaves nothing.
-    name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
+    name = _ascii_name(source.stem)
     try:
         level_map = LevelMap.from_height(height, levels, name, wrapped=_is_wrapped(height, levels))
     except InputError as error:
@@ -242,6 +246,12 @@ def drawing_from(
         raise InputError(f"{source}{part}", error.rule, error.got, error.cure) from error
     origin = {"kind": "height map", "name": source.name, "height_sha256": sha256_file(source)}
     return Drawing(level_map, origin, None)
+
+
+def _ascii_name(stem: str) -> str:
+    """Turn the name of a file into one that mask shops take, ASCII without accents; "height" where nothing is left."""
+    plain = "".join(c for c in unicodedata.normalize("NFKD", stem) if not unicodedata.combining(c))
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in plain).strip("_") or "height"
 
 
 def _kept_light(design: Design, own: LevelMap) -> float:

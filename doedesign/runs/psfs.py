@@ -22,7 +22,7 @@ from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed
 from fab.figure import drawn_beside
-from fab.files import canonical_json
+from fab.files import canonical_json, path_of
 from fab.height import HeightMap
 from fab.plots.height import plot_height
 from fab.runsheet.tables import CertifiedOrder
@@ -104,7 +104,7 @@ def _heights_of(run: Run, masks: str | Path | None) -> dict[str, np.ndarray]:
     # A training that left the DOE as it was has only the heights after rounding.
     before = {"continuous": read_any_height(file).height_m} if file.is_file() else {}
     designs = {**before, "quantised": level_map.height_m}
-    folder = own_order(run.spec.name, run.folder, level_map) if masks is None else Path(masks)
+    folder = own_order(run.spec.name, run.folder, level_map) if masks is None else path_of(masks, "masks")
     if folder is None:
         log.info(f"no mask order of this run; write one with: doedesign masks {run.folder}")
         return designs

@@ -103,7 +103,11 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
         raise InputError("spec", rule, f"a {type(path).__name__}", cure)
     path = Path(path)
     raw = read_toml(path, *_FILES[Spec])
-    keys = [_override(raw, text) for text in ([overrides] if isinstance(overrides, str) else overrides)]
+    given: Any = overrides if isinstance(overrides, tuple | list) else [overrides]
+    if not all(isinstance(text, str) for text in given):
+        rule, cure = "must be several changes, as text", 'For example ["process.levels=8"].'
+        raise InputError("overrides", rule, repr(overrides), cure)
+    keys = [_override(raw, text) for text in given]
     tables = {field.alias for field in Spec.model_fields.values()}
     for name, value in values.items():
         keys.append(key := name.replace("__", ".") if "__" in name or name in tables else f"optimize.{name}")

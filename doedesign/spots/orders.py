@@ -15,11 +15,10 @@ from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
 from fab.aperture import MaskAperture, RoundAperture
 from fab.grid import Grid
-from fab.units import MILLIMETRES, PlaceUnit
-from sim.camera import Camera
+from fab.units import MILLIMETRES, PlaceUnit, require_kind
+from sim.camera import Camera, require_colour
 from sim.illumination import Beam, EvenBeam
-from sim.metrics import opening
-from sim.optic import CellOptic
+from sim.metrics import cells_of, opening
 from sim.propagation.directions import DirectionSum, peak_amplitudes
 
 if TYPE_CHECKING:
@@ -264,7 +263,7 @@ class OrderTables:
 
 
 def order_table(
-    optic: CellOptic,
+    optic: Any,
     spots: Spots,
     *,
     period_m: float | None = None,
@@ -275,7 +274,7 @@ def order_table(
     """Look at the spots of a DOE: as drawn, as fabricated, with or without the light of its walls.
 
     Args:
-        optic: the DOE.
+        optic: the DOE: a design, or an optic of cells, such as a DOE as fabricated.
         spots: where light should go.
         period_m: side of a unit cell that is repeated, metres. Only whole periods within the aperture, in a square if
             it is round, are looked at, as if there were no end of them: behind a round aperture the feet of bright
@@ -283,7 +282,14 @@ def order_table(
         count: columns and rows of a grid of equal spots, for the ceiling.
         levels: levels of the DOE, for the ceiling.
         colour: number of the colour whose first wavelength is looked at.
+
+    Raises:
+        InputError: an argument of another kind, or a colour that the camera does not have.
     """
+    optic = cells_of("optic", optic)
+    cure = "For example dd.Spots(waves_per_m, shares); those of a spec are in dd.fabricated(design, seed=0).aimed."
+    require_kind("spots", spots, Spots, cure)
+    require_colour(optic.camera, colour)
     camera, line = optic.camera, next(one for one in optic.camera.lines if one.colour == colour)
     # Directions are what a lens would show in its focus, whatever the light on the DOE and the way behind it.
     away = camera.distance_m is not None and not camera.in_angles

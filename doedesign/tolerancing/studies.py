@@ -39,7 +39,7 @@ from fab.draws import (
     variation_at,
 )
 from fab.errors import InputError
-from fab.files import sha256_bytes
+from fab.files import path_of, sha256_bytes
 from fab.process import DEVIATIONS, Process, Variation, error_names
 from fab.units import require_kind
 from sim.camera import Camera
@@ -243,23 +243,25 @@ def study(
     design = open_design(design, masks)
     made = resolve_process(process, design.levels, design.spec and design.spec.process)
     # Errors are those of the lab; the design sees them through its masks.
-    made = with_edge_moves(_with_errors(made, errors) if errors else made, design.edge_moves_m)
+    made = with_edge_moves(made if errors is None else _with_errors(made, errors), design.edge_moves_m)
     if not sources_of(made):
         rule = "a tolerance study needs errors that vary"
         cure = 'Give a process with errors, such as "contact_aligner".'
         raise InputError("process", rule, "none with a sigma above zero", cure)
-    if seed < 0:
-        raise InputError("seed", "must not be negative", seed, "For example 0.")
+    if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
+        raise InputError("seed", "must not be negative, a whole number", repr(seed), "For example 0.")
     if not hasattr(evaluate, "__qualname__"):  # by which its draws are known
         raise InputError("evaluate", "must be a function", type(evaluate).__name__, "Write one with def.")
     if out is not None and "<" in evaluate.__qualname__:
         rule = "must be a function at the top of a module, for a study on disk is known by its name"
         raise InputError("evaluate", rule, evaluate.__qualname__, "Move it there.")
-    given = limits if limits is not None else design.spec.limits if design.spec else ()
-    given = [given] if isinstance(given, str) else given
+    given: Any = limits if limits is not None else design.spec.limits if design.spec else ()
+    given = given if isinstance(given, tuple | list) else [given]
+    if not all(isinstance(one, str | LimitSpec) for one in given):
+        raise InputError("limits", "must be several conditions, as text", repr(given), 'For example ["strehl >= 0.6"].')
     obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in given)
     bare = _for_workers(design)
-    journal = Journal(None if out is None else Path(out), _identity(bare, made, seed, evaluate), DrawLines())
+    journal = Journal(None if out is None else path_of(out, "out"), _identity(bare, made, seed, evaluate), DrawLines())
     run = _runner(design, workers, scheduler, out is None)
     return Study(bare, made, obeyed, seed, journal, evaluate, run, quiet)
 

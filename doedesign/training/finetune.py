@@ -41,7 +41,8 @@ from doedesign.training.loss import adam_step, history_line, losses
 from doedesign.training.pairs import PairData, Pairs, crop_shape, cut, find_pairs, pairs_digest, split_pairs
 from doedesign.training.validation import EvaluationResult, HeldOutScene, judge
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_bytes, write_atomic
+from fab.files import canonical_json, path_of, sha256_bytes, write_atomic
+from fab.units import require_kind
 from sim.light import srgb_from_linear
 from sim.store import write_bank
 
@@ -89,7 +90,8 @@ def finetune(
             longer finite.
         KeyboardInterrupt: it was stopped; the same call goes on from there.
     """
-    folder = Path(pairs)
+    require_kind("model", model, Model, 'Open one by dd.Model.open("runs/NAME/trained").')
+    folder = path_of(pairs, "pairs")
     with stoppable():  # which ends the preparation, too
         options, psfs = _options(model, steps, learning_rate, seed), psfs or model.psfs()
         split = split_pairs(find_pairs(folder), validation, seed, str(folder))

@@ -46,6 +46,7 @@ from fab.files import (
     MANIFEST_NAME,
     canonical_json,
     clear_killed,
+    path_of,
     read_json,
     scratch_folder,
     sha256_bytes,
@@ -132,7 +133,7 @@ def trained(
     """
     place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else scratch_folder()
     with stoppable() as stop, place as folder:
-        _run(job, Path(folder), stop, tensorboard)
+        _run(job, path_of(folder, "out"), stop, tensorboard)
         return opened(Path(folder))
 
 

@@ -53,8 +53,9 @@ from doedesign.training.job import TrainingJob, perceptual_distance, trained_mod
 from doedesign.training.joint import JointState, Trainer, devices_mesh, layout_of, resting_doe
 from doedesign.training.validation import SCENE_SEED, EvaluationResult, HeldOutScene, Split, judge, split_pictures
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_bytes, sha256_file, write_atomic
+from fab.files import canonical_json, path_of, sha256_bytes, sha256_file, write_atomic
 from fab.level_map import LevelMap
+from fab.units import require_kind
 from sim.imaging.occlusion import Model as OcclusionModel
 from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
@@ -192,7 +193,8 @@ def prepared(
     kind = obstruction_from_spec(spec, source, obstruction)
     lpips, perceptual = perceptual_distance(how, how.size, f"{source}: train.size", lpips_weights)
     _require_possible(spec, source)
-    given, own = (None if folder is None else Path(folder) for folder in (images, validation))
+    folders = {"images": images, "validation": validation}
+    given, own = (None if folder is None else path_of(folder, name) for name, folder in folders.items())
     split = split_pictures(given, own, how.validation, how.seed)
     data, held_out = _scenes(spec, kind, split)
     settings = {
@@ -218,6 +220,7 @@ def prepared(
 
 def _with_options(design: Design, options: Mapping[str, Any]) -> tuple[Design, Spec]:
     """The design with a spec whose training has other options and a size that the sensor has, and that spec."""
+    require_kind("design", design, Design, "Of a run: dd.open_design(folder).")
     if design.spec is None:
         raise InputError("design", "must have a spec, which says how to train", "none", "Optimise it from a spec.")
     spec = design.spec

@@ -10,11 +10,13 @@ its diameter, a rectangular one [width, height], along x and along y, and any ot
     picture     a mask from a file
 """
 
+import math
 from typing import Any
 
 from fab.aperture.mask import MaskAperture
 from fab.aperture.outline import Aperture, RectangularAperture, RoundAperture
 from fab.errors import InputError
+from fab.units import number_of
 
 __all__ = ["Aperture", "MaskAperture", "RectangularAperture", "RoundAperture", "aperture_from", "diameter_of"]
 
@@ -43,12 +45,12 @@ def aperture_from(
     if isinstance(value, dict):
         return MaskAperture.from_record(value, unit_m, digits, where, shape)
     given = value if isinstance(value, list | tuple) else [value]
-    try:
-        sizes = [float(size) if unit_m == 1.0 else float(size) * unit_m for size in given]
-    except (TypeError, ValueError, OverflowError):
-        sizes = []
+    numbers = [number_of(size) for size in given]
+    # What is no number, such as text, or beyond all floats is no length.
+    unlike = any(math.isnan(number) or number != size for number, size in zip(numbers, given, strict=True))
+    sizes = numbers if unit_m == 1.0 else [number * unit_m for number in numbers]
     sizes = sizes if digits is None else [round(size, digits) for size in sizes]
-    if len(sizes) not in (1, 2):
+    if len(sizes) not in (1, 2) or unlike:
         got = " ".join(repr(value).split())
         rule, got = "must be a diameter or [width, height]", got if len(got) < 60 else f"{got[:57]}..."
         raise InputError(where, rule, got, "Give one or two lengths.")

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.errors import InputError
 from fab.grid import SLACK, Grid
-from fab.units import format_length
+from fab.units import format_length, number_of, numbers_of
 
 
 class Aperture(ABC):
@@ -100,9 +101,17 @@ class RoundAperture(Aperture):
 
     Attributes:
         diameter_m: diameter, metres; an infinite one is all of a raster, as of a piece that was cut out of a DOE.
+
+    Raises:
+        InputError: something other than a number.
     """
 
     diameter_m: float
+
+    def __post_init__(self) -> None:
+        if math.isnan(number_of(self.diameter_m)):
+            cure = "For example 1e-3 for 1 mm."
+            raise InputError("aperture: diameter_m", "must be a number of metres", repr(self.diameter_m), cure)
 
     @property
     def extent_m(self) -> tuple[float, float]:
@@ -155,10 +164,20 @@ class RectangularAperture(Aperture):
     """A rectangle.
 
     Attributes:
-        size_m: height and width ``(y, x)``, metres.
+        size_m: height and width ``(y, x)``, metres; a list becomes a tuple.
+
+    Raises:
+        InputError: something other than two numbers.
     """
 
     size_m: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        sides = numbers_of(self.size_m)
+        if len(sides) != 2 or any(map(math.isnan, sides)):
+            rule = "must be two numbers (y, x), height and width in metres"
+            raise InputError("aperture: size_m", rule, repr(self.size_m), "For example (1e-3, 2e-3).")
+        object.__setattr__(self, "size_m", sides)
 
     @property
     def extent_m(self) -> tuple[float, float]:

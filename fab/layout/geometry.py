@@ -25,7 +25,7 @@ from fab.grid import Grid
 from fab.layout.polygons import annulus_sectors, doubled_area, frame_around_box, rectangles, sectors_around_square
 from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.units import MM, NM, UM, format_length
+from fab.units import MM, NM, UM, format_length, number_of, told_length
 
 _NAME = re.compile(r"[A-Z0-9_]{1,32}")
 _FEMTO = 10**15
@@ -203,10 +203,10 @@ class Chrome:
 
     def opening(self, relief: Aperture) -> Aperture:
         """Return the opening for a DOE with this relief."""
-        opening = relief.shrunk(self.overlap_m) if self.overlap_m >= 0 else None
+        opening = relief.shrunk(self.overlap_m) if number_of(self.overlap_m) >= 0 else None
         if opening is None or not opening.narrowest_m > 0:
             rule = f"must be 0 or more and leave an opening in an aperture of {relief}"
-            raise InputError("chrome overlap", rule, format_length(self.overlap_m), "Choose a smaller one.")
+            raise InputError("chrome overlap", rule, told_length(self.overlap_m), "Choose a smaller one.")
         return opening
 
     def rim_m(self, level_map: LevelMap) -> float:
@@ -221,8 +221,8 @@ class Chrome:
             # Whole tenths of a millimetre, because this number stands on the order form.
             outer = (np.ceil((np.hypot(*extent_m) / 2 + 0.5 * MM) / (0.1 * MM) - 1e-9)) * 0.1 * MM
         reach_m += _CLEAR_M
-        if not reach_m < outer < float("inf"):
-            rule, got = f"must exceed what the opening needs, {format_length(reach_m)}", format_length(outer)
+        if not reach_m < number_of(outer) < float("inf"):
+            rule, got = f"must exceed what the opening needs, {format_length(reach_m)}", told_length(outer)
             raise InputError("chrome outer radius", rule, got, "Choose a larger one.")
         return float(outer)
 
@@ -292,8 +292,8 @@ def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
     if outer > _LIMIT:
         got = format_length(outer * dbu_m)
         raise InputError("chrome outer radius", "must fit 32-bit coordinates", got, "Choose a smaller one.")
-    if not chrome.chord_error_m >= dbu_m:
-        got = format_length(chrome.chord_error_m)
+    if not number_of(chrome.chord_error_m) >= dbu_m:
+        got = told_length(chrome.chord_error_m)
         raise InputError("chrome chord error", "must be one database unit or more", got, "Choose a larger one.")
     chord_error, (half_y, half_x) = chrome.chord_error_m / dbu_m, half_extent(opening, dbu_m)
     if isinstance(opening, RoundAperture):

@@ -2,12 +2,11 @@
 
 import math
 from dataclasses import dataclass, field
-from numbers import Integral
 from typing import ClassVar, Literal
 
 from fab.errors import InputError
 from fab.files import IF_ANY
-from fab.units import MM, UM, format_length
+from fab.units import MM, UM, format_length, number_of, numbers_of, told_length
 
 # Primary flats of SEMI M1 by diameter, both in millimetres; larger wafers have a notch.
 _FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}
@@ -62,24 +61,35 @@ class Wafer:
 
     def __post_init__(self) -> None:
         for name in ("diameter_m", "thickness_m", "blank_m"):
-            if not 0 < getattr(self, name) < 1:
-                got = format_length(getattr(self, name))
+            if not 0 < number_of(value := getattr(self, name)) < 1:
+                got = told_length(value)
                 raise InputError(f"wafer: {name}", "must be positive and below 1 m", got, "Check its unit.")
-        if self.pitch_m is not None and not 0 < self.pitch_m < 1:
-            rule, got = "must be positive and below 1 m", format_length(self.pitch_m)
+        if self.pitch_m is not None and not 0 < number_of(self.pitch_m) < 1:
+            rule, got = "must be positive and below 1 m", told_length(self.pitch_m)
             raise InputError("wafer: pitch_m", rule, got, "Check its unit, or leave it out.")
-        if self.chrome not in ("liftoff", "etch"):  # another word would change the tone of its photomask
+        if not isinstance(self.chrome, str) or self.chrome not in (
+            "liftoff",
+            "etch",
+        ):  # another word would change the tone of its photomask
             raise InputError("wafer: chrome", 'must be "liftoff" or "etch"', repr(self.chrome), "Choose one of them.")
         if self.blank_m < self.diameter_m:
             rule = f"must hold the wafer of {format_length(self.diameter_m)}"
             raise InputError("wafer: blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
-        if self.dies is not None and not all(isinstance(n, Integral) and n >= 1 for n in self.dies):
-            raise InputError("wafer: dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
         if self.dies is not None:
-            object.__setattr__(self, "dies", tuple(int(n) for n in self.dies))  # of numpy, they would not go into JSON
+            dies = numbers_of(self.dies)
+            if len(dies) != 2 or not all(n >= 1 and n.is_integer() for n in dies):
+                rule = "must be 1 or more rows and columns"
+                raise InputError("wafer: dies", rule, repr(self.dies), "For example (3, 3).")
+            object.__setattr__(self, "dies", tuple(int(n) for n in dies))  # of numpy, they would not go into JSON
         if self.dies is not None and self.dies[0] * self.dies[1] > _MOST_DIES:
             rule = f"must be at most {_MOST_DIES} altogether"
             raise InputError("wafer: dies", rule, self.dies, "Let the wafer be filled.")
+        for name in ("line_splits_m", "edge_moves_m"):
+            moves = numbers_of(given := getattr(self, name))
+            if any(map(math.isnan, moves)):
+                cure = "For example (0.2e-6, -0.2e-6)."
+                raise InputError(f"wafer: {name}", "must be several numbers of metres", repr(given), cure)
+            object.__setattr__(self, name, moves)
         if len(self.line_splits_m) > _MOST_SPLITS:
             rule, got = f"must be at most {_MOST_SPLITS}", len(self.line_splits_m)
             raise InputError("wafer: line splits", rule, got, "Take fewer, since each is a drawing of its own.")
@@ -93,9 +103,9 @@ class Wafer:
             cure = "Leave one of them out."
             raise InputError("wafer: edge moves", "edges are moved by these lengths, or against the bias", "both", cure)
         for name, most_m in (("lane_m", 10 * MM), ("edge_exclusion_m", self.diameter_m / 4)):
-            if not 0 <= (value := getattr(self, name)) <= most_m:
+            if not 0 <= number_of(value := getattr(self, name)) <= most_m:
                 rule = f"must lie from 0 to {format_length(most_m)}"
-                raise InputError(f"wafer: {name}", rule, format_length(value), "Check its unit.")
+                raise InputError(f"wafer: {name}", rule, told_length(value), "Check its unit.")
         if self.dies is not None:
             self.require_room(self.dies[0] * self.dies[1])
 

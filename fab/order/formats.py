@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from fab.errors import InputError
+from fab.units import require_kind
 
 PlateFormat = Literal["gds.gz", "gds"]
 _MOST_CELLS = 1000
@@ -29,9 +30,10 @@ class Formats:
 
     def __post_init__(self) -> None:
         known = get_args(PlateFormat)
-        if self.plates not in known:
+        if not isinstance(self.plates, str) or self.plates not in known:
             rule = f"must be one of {', '.join(known)}"
             raise InputError("formats: plates", rule, repr(self.plates), "Choose one of them.")
-        if not 1 <= self.mesh_cells <= _MOST_CELLS:
-            rule = f"must lie from 1 to {_MOST_CELLS}; beyond that viewers give up"
-            raise InputError("formats: mesh_cells", rule, self.mesh_cells, "Choose fewer, or mesh a window.")
+        require_kind("formats: combined_gds", self.combined_gds, bool, "Give True or False.")
+        if not (isinstance(self.mesh_cells, int) and 1 <= self.mesh_cells <= _MOST_CELLS):
+            rule = f"must be a whole number from 1 to {_MOST_CELLS}; beyond that viewers give up"
+            raise InputError("formats: mesh_cells", rule, repr(self.mesh_cells), "Choose fewer, or mesh a window.")

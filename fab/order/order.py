@@ -269,6 +269,11 @@ def plan_order(
             "mask shop enlarge the cell of a die."
         )
         raise InputError("process", rule, got, cure)
+    if lost := [c for c in level_map.name if c.isalnum() and not c.isascii()]:
+        said = (
+            "mask shops take A-Z, digits and _ alone: of %s the names of files and cells leave out %s and begin with %s"
+        )
+        log.warning(said, level_map.name, "".join(dict.fromkeys(lost)), plain_name(level_map.name))
     wafer, terms = wafer or Wafer(), terms or OrderTerms()
     terms = terms if terms.sizing else replace(terms, sizing=UNSIZED)
     report = check(level_map, Rules.from_process(made_by, terms.address_grid_m))

@@ -34,6 +34,8 @@ def _plain(value: Any) -> Any:
         return _plain(value._asdict())
     if isinstance(value, Mapping):
         return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
     return [_plain(part) for part in value] if isinstance(value, tuple | list) else value
 
 
@@ -66,6 +68,11 @@ def as_recorded(order: Order) -> Order:
             found = errors.errors(include_url=False)[0]
             where = ": ".join(map(str, (name, *found["loc"])))
             raise InputError(where, found["msg"], repr(found["input"])[:60], "Give a value of its kind.") from errors
+    try:
+        canonical_json(asked["source"])
+    except (TypeError, ValueError) as error:  # another kind, NaN, or a list within itself
+        cure = "Give text, finite numbers, lists and dictionaries."
+        raise InputError("source", "must be what JSON can hold", repr(order.source), cure) from error
     return replace(order, **asked)
 
 

@@ -6,7 +6,7 @@ from numbers import Integral
 
 from fab.errors import InputError
 from fab.files import IF_ANY
-from fab.units import format_length
+from fab.units import number_of, told_length
 
 _REVISION = re.compile(r"[A-Z0-9]{1,3}")
 _LONGEST_TEXT = 200
@@ -69,8 +69,11 @@ class OrderTerms:
             if isinstance(value, str) and not (value.isprintable() and 0 < len(value.strip()) <= _LONGEST_TEXT):
                 rule = f"must be one line of 1 to {_LONGEST_TEXT} characters"
                 raise InputError(where, rule, repr(value)[:60], "Shorten it, or leave it out.")
-            if one.name.endswith("_m") and isinstance(value, int | float) and not 0 < value < 0.1:
-                raise InputError(where, "must be positive and below 100 mm", format_length(value), "Check its unit.")
+            if one.name.endswith("_m") and value is not None and not 0 < number_of(value) < 0.1:
+                rule = "must be metres, positive and below 100 mm"
+                raise InputError(where, rule, told_length(value), "Check its unit.")
+            if "str" in str(one.type) and value is not None and not isinstance(value, str):
+                raise InputError(where, "must be text", repr(value), "Leave it out if it is open.")
         if not _REVISION.fullmatch(self.revision):
             rule = "must be one to three capitals A-Z or digits"
             raise InputError("order: revision", rule, repr(self.revision), 'For example "A" or "02".')
@@ -80,6 +83,6 @@ class OrderTerms:
             )
         if self.quantity is not None:
             object.__setattr__(self, "quantity", int(self.quantity))  # of numpy, it would not go into JSON
-        if self.defects_per_cm2 is not None and not 0 <= self.defects_per_cm2 < 1e6:
-            got = self.defects_per_cm2
+        if self.defects_per_cm2 is not None and not 0 <= number_of(self.defects_per_cm2) < 1e6:
+            got = repr(self.defects_per_cm2)
             raise InputError("order: defects_per_cm2", "must be 0 or more, below a million", got, "Check it.")

@@ -25,7 +25,7 @@ import numpy as np
 
 from fab.errors import InputError
 from fab.figure import html_of
-from fab.files import MANIFEST_NAME, atomic_folder, sha256_bytes, sha256_file, write_atomic
+from fab.files import MANIFEST_NAME, atomic_folder, path_of, sha256_bytes, sha256_file, write_atomic
 from fab.gds.oasis import write_oasis
 from fab.gds.writer import write_gds
 from fab.layout.geometry import Chrome
@@ -220,7 +220,7 @@ def write_planned(folder: str | Path, order: Order, *, predict: Predict = lambda
 
     The light that its run sheet speaks of comes from `predict`.
     """
-    folder, order = Path(folder), as_recorded(order)
+    folder, order = path_of(folder, "folder"), as_recorded(order)
     _require_own(folder)
     with atomic_folder(folder) as fresh:
         manifest, found = _write_files(fresh, order, predict)

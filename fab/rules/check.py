@@ -35,7 +35,7 @@ from fab.process import Process
 from fab.rules import bitplanes as bits
 from fab.rules.widths import count_bounded, narrow_runs, shortest
 from fab.stock import process_from
-from fab.units import UM, format_length, require_kind
+from fab.units import UM, format_length, number_of, require_kind
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,12 +72,11 @@ class Rules:
     def __post_init__(self) -> None:
         cure = "Give a length such as 1e-6."
         for name in ("minimum_line_m", "minimum_space_m"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"rules: {name}", "must be finite and not negative", getattr(self, name), cure)
-        for name in ("address_m", "window_m"):
-            value = getattr(self, name)
-            if value is not None and not 1e-15 <= value < math.inf:
-                raise InputError(f"rules: {name}", "must be positive and finite", value, cure)
+            if not 0 <= number_of(value := getattr(self, name)) < math.inf:
+                raise InputError(f"rules: {name}", "must be finite and not negative, in metres", repr(value), cure)
+        for name, needed in (("address_m", self.address_m is not None), ("window_m", True)):
+            if needed and not 1e-15 <= number_of(value := getattr(self, name)) < math.inf:
+                raise InputError(f"rules: {name}", "must be positive and finite, in metres", repr(value), cure)
 
     @classmethod
     def from_process(cls, process: Process, address_m: float | None = None) -> "Rules":

@@ -30,6 +30,7 @@ from fab.levels import Levels
 from fab.process import Process
 from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair_moves import RepairTask, broken, loss, offends, sweep
+from fab.units import number_of
 
 # How much phase error (1 - cos) one pixel of deficit, or one kissing corner, is worth in each sweep.
 _WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -208,8 +209,9 @@ def _phases(levels: Levels, waves_per_metre: float) -> NDArray[np.float64]:
 
 def _checked_waves(levels: Levels, waves_per_metre: float | None) -> float:
     waves = 1 / levels.period_m if waves_per_metre is None else waves_per_metre
-    if not 0 < waves < math.inf:
-        raise InputError("waves per metre", "must be positive and finite", waves, "Give (n - 1) / wavelength.")
+    if not 0 < number_of(waves) < math.inf:
+        rule = "must be a positive and finite number"
+        raise InputError("waves per metre", rule, repr(waves), "Give (n - 1) / wavelength.")
     return waves
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import read_npy, write_atomic
+from fab.files import path_of, read_npy, write_atomic
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import ModelEntry
@@ -126,7 +126,7 @@ def write_zemax_sag(
     takes 22 bytes: a 4400 x 4400 map makes 426 MB, so choose a window (at least 5 pixels either way); the decentre in
     the header puts it where it is.
     """
-    _write_grid(Path(path), level_map, _sag_lines(level_map.levels, side), window, side)
+    _write_grid(path_of(path), level_map, _sag_lines(level_map.levels, side), window, side)
 
 
 def write_zemax_phase(
@@ -151,7 +151,7 @@ def write_zemax_phase(
             leaves through it.
     """
     phase = 2 * np.pi * waves_per_metre * level_map.levels.heights_m()
-    _write_grid(Path(path), level_map, [f"{radians:14.9f} 0 0 0 0\r\n" for radians in phase], window, side)
+    _write_grid(path_of(path), level_map, [f"{radians:14.9f} 0 0 0 0\r\n" for radians in phase], window, side)
 
 
 def _write_grid(path: Path, level_map: LevelMap, lines: list[str], window: PixelWindow | None, side: Side) -> None:

@@ -7,6 +7,7 @@ millions of triangles, so either has a cap.
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -33,12 +34,20 @@ class Patch:
         y_m: the same along y.
         width_m: its edge, metres; the nearest whole number of pixels is taken.
         step: whether it is wanted as STEP, too, and not only as a mesh.
+
+    Raises:
+        InputError: something other than a number of metres.
     """
 
     x_m: float
     y_m: float
     width_m: float
     step: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("x_m", "y_m", "width_m"):
+            if not isinstance(value := getattr(self, name), Real):  # one beyond the map, or NaN, is told with its size
+                raise InputError(f"patch: {name}", "must be a number of metres", repr(value), "For example 50e-6.")
 
     def window(self, grid: Grid) -> PixelWindow:
         """Return the pixels nearest to the patch, which must lie on the map."""

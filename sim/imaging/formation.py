@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fab.errors import InputError
+from fab.units import number_of, require_kind
 from sim.camera import Camera
 from sim.imaging.common import with_common
 from sim.imaging.convolve import Border, Otf, Window, convolve, plan_otf, superpose
@@ -116,9 +118,16 @@ def capture(
         `[c, y, x]`, differentiable in PSFs and images. Where nothing lands, rounding may leave -1e-7 of the brightest.
 
     Raises:
+        InputError: no scene or optics, or a length of the optics that is not positive.
         ValueError: PSFs or layers of another number or shape, an obstruction that is not before the background, or an
             unknown name.
     """
+    require_kind("scene", scene, Scene, "For example sim.Scene(background, 5.0).")
+    require_kind("optics", optics, Optics, "For example sim.Optics.of(bank, camera, depths_m).")
+    for name in ("aperture_m", "focal_m", "pixel_m"):
+        if not 0 < number_of(value := getattr(optics, name)) < np.inf:
+            rule = "must be a positive number of metres"
+            raise InputError(f"optics: {name}", rule, repr(value), "For example 5e-3 for 5 mm.")
     check_names(model, outside)
     check_layers(scene, *optics.psf.shape[:2])
     window = shadow_px(scene, optics) if follows_light(model) else 1

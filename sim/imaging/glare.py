@@ -16,6 +16,7 @@ import scipy.fft
 from jaxtyping import Float
 
 from fab.errors import InputError
+from fab.units import number_of
 
 _MOST_DRAWN = 0.5  # of the light, scattered by another lens of a kind
 
@@ -38,13 +39,14 @@ class Glare:
 
     def __post_init__(self) -> None:
         """Raise an InputError for a number out of range."""
-        if not 0 <= self.share < 1:
-            raise InputError("glare.share", "must lie from 0 to below 1", f"{self.share:g}", "For example 0.02.")
+        if not 0 <= number_of(self.share) < 1:
+            raise InputError("glare.share", "must lie from 0 to below 1", repr(self.share), "For example 0.02.")
         for name in ("fall", "core_px"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"glare.{name}", "must be positive", f"{getattr(self, name):g}", "Correct it.")
-        if self.window < 1 or self.window % 2 == 0:
-            raise InputError("glare.window", "must be odd, so that it has a middle pixel", f"{self.window}", "Add 1.")
+            if not 0 < number_of(value := getattr(self, name)) < np.inf:
+                raise InputError(f"glare.{name}", "must be a positive number", repr(value), "Correct it.")
+        if not number_of(self.window) >= 1 or self.window % 2 != 1:
+            rule = "must be a whole, odd number, so that it has a middle pixel"
+            raise InputError("glare.window", rule, repr(self.window), "Add 1.")
 
     def kernel(self) -> Float[np.ndarray, "v u"]:
         """The spread function `[v, u]` on the window's pixels; its sum is 1."""

@@ -1,16 +1,16 @@
 """Where the light on a DOE goes: its energy budget."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.fft import fft
 
+from fab.units import distance_from, require_kind
 from sim.camera import Colour
 from sim.metrics.measures import far_spot
-from sim.metrics.transmission import opening
-from sim.optic import CellOptic
+from sim.metrics.transmission import cells_of, opening
 from sim.source import source_path_m
 from sim.tracing import total
 
@@ -57,9 +57,9 @@ def _band_energy(field: Complex[np.ndarray, "y x"], slope: float, band: float = 
 
 
 def energy_budget(
-    optic: CellOptic,
+    optic: Any,
     psf: Float[np.ndarray, "v u"],
-    depth_m: float,
+    depth_m: float | str,
     colour: Colour,
     *,
     pitch_m: float | None = None,
@@ -67,15 +67,21 @@ def energy_budget(
     """Energy budget of one PSF of one colour.
 
     Args:
-        optic: the DOE that made the PSF, on the axis.
+        optic: the DOE that made the PSF, on the axis: a design, or an optic of cells.
         psf: `[y, x]` PSF on the sensor, Fresnel loss included.
-        depth_m: source depth, metres.
+        depth_m: source depth, metres or with a unit.
         colour: colour of this PSF.
         pitch_m: pitch of the DOE's grid, metres, where the optic's cells are parts of its cells.
 
     The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc), so
     `uncollected` near zero or below it would show a fault in either.
+
+    Raises:
+        InputError: something other than a DOE or a colour, or a depth that is not positive.
     """
+    optic = cells_of("optic", optic)
+    require_kind("colour", colour, Colour, "A camera has them: camera.colours[0].")
+    depth_m = distance_from(depth_m, "depth_m")
     camera = optic.camera
     cells = camera.grid.shape[0] * camera.grid.shape[1]
     scale = camera.opening.area_in(camera.grid.pitch_m, cells)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.units import distance_from, number_of, require_kind
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
 from sim.tracing import is_traced, total
@@ -66,8 +67,13 @@ def encircled_energy(
     Not divided by the total; partly covered pixels count by area.
 
     Raises:
-        InputError: no radii, or radii that are not numbers of metres of 0 or more.
+        InputError: no radii, radii that are not numbers of metres of 0 or more, no PSFs, or no pitch.
     """
+    if not is_traced(psfs) and (np.ndim(psfs) < 2 or np.asarray(psfs).dtype.kind not in "fiu"):
+        got = f"{type(psfs).__name__} of shape {np.shape(psfs)}"
+        raise InputError("psfs", "must be energies [..., y, x]", got, "A bank has them: bank.energy.")
+    if not 0 < number_of(pixel_m) < np.inf:
+        raise InputError("pixel_m", "must be a positive number of metres", repr(pixel_m), "For example 2e-6 for 2 um.")
     given = np.asarray(radii_m)
     if given.ndim != 1 or given.size == 0 or given.dtype.kind not in "fiu" or not np.all(given >= 0):
         rule, cure = "must be several radii, numbers of metres of 0 or more", "For example [1e-6, 2e-6]."
@@ -104,12 +110,16 @@ class RingToDisc(NamedTuple):
     disc_radius_m: float
 
 
-def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
+def ring_to_disc(psf: Psf, camera: Camera, depth_m: float | str) -> RingToDisc:
     """Ring:disc ratio of a near `psf` `[y, x]` of a `camera` (3:1 in the paper's simulation, 1:1 in its prototype).
 
-    The disc is that of `disc_radius_m`, `depth_m` in metres; without light in it the ratio is infinite.
+    The disc is that of `disc_radius_m`, `depth_m` in metres or with a unit; without light in it the ratio is infinite.
+
+    Raises:
+        InputError: no camera, no PSF, or a depth that is not positive.
     """
-    radius = disc_radius_m(camera, depth_m)
+    require_kind("camera", camera, Camera, "A design has one: design.camera.")
+    radius = disc_radius_m(camera, distance_from(depth_m, "depth_m"))
     disc = energy_within(psf, camera.pixel_m, radius)
     ring = total(psf) - disc
     if is_traced(disc):

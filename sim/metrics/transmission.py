@@ -17,12 +17,12 @@ def mean_transmission(doe: Any) -> Complex[np.ndarray, " w"] | Complex[Array, " 
 
     `doe` is an optic of cells, or what carries one, such as a design; an InputError for anything else.
     """
-    cells = _cells("doe", doe)
+    cells = cells_of("doe", doe)
     return _mean_over_aperture(cells, cells.means)
 
 
-def _cells(name: str, doe: Any) -> CellOptic:
-    """The optic of cells that something is or carries; an InputError for anything else, which has no transmission."""
+def cells_of(name: str, doe: Any) -> CellOptic:
+    """The optic of cells that a `doe` is or carries, the value of `name`; an InputError for anything else."""
     found = doe.as_optic() if hasattr(doe, "as_optic") else doe
     if not isinstance(found, CellOptic):
         cure = "Give a design, a DOE as fabricated, or sim.HeightOptic.of(camera, height_m)."
@@ -68,7 +68,7 @@ def strehl(doe: Any, nominal: Any) -> Float[np.ndarray, " w"] | Float[Array, " w
     Each is an optic of cells, or what carries one, such as a design; an InputError for anything else. The cells of
     `doe` and those of `nominal` may be parts of those that were drawn.
     """
-    doe, nominal = _cells("doe", doe), _cells("nominal", nominal)
+    doe, nominal = cells_of("doe", doe), cells_of("nominal", nominal)
     (ny, nx), other = doe.camera.grid.shape, nominal.camera.grid.shape[0]
     xp, common = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np, math.lcm(ny, other)
     meant = in_parts(xp.conj(xp.asarray(nominal.means)), common // other)

@@ -28,6 +28,7 @@ from jaxtyping import Array, Complex, Float, Inexact
 
 from fab.aperture import Aperture, RoundAperture
 from fab.grid import Grid
+from fab.units import distances_from, require_kind
 from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.material import refractive_index
@@ -140,8 +141,10 @@ def with_edges(
 
     Raises:
         ValueError: heights of another shape than the grid's.
-        InputError: heights that `sim.optic.heights_on` refuses.
+        InputError: no camera, depths that are not positive, or heights that `sim.optic.heights_on` refuses.
     """
+    require_kind("camera", camera, Camera, "A design has one: design.camera.")
+    depths_m = distances_from(depths_m, "depths_m") or (np.inf,)
     drawn, height = camera, heights_on(camera, height_m)
     range_m = None if is_traced(height) else float(jnp.ptp(height))
     wavelengths = tuple(dict.fromkeys(wavelengths_m or (line.wavelength_m for line in camera.lines)))

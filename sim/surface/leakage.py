@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fab.units import require_kind
 from sim.camera import Colour
 from sim.metrics import mean_transmission
 from sim.psf_bank import psf
@@ -53,7 +54,12 @@ def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour, *, sampling: f
 
     Energies per unit power incident on the clear aperture, Fresnel loss included, by three independent transforms: that
     they fit (`SplitPsf.excess`) is a check, not an assumption.
+
+    Raises:
+        InputError: something other than a DOE as fabricated or a colour.
     """
+    require_kind("doe", doe, FabricatedDoe, 'For example design.fabricated("contact_aligner", seed=0).')
+    require_kind("colour", colour, Colour, "A camera has them: camera.colours[0].")
     chosen = np.array([doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m])
     seen = [doe.view(wavelength, depth_m) for wavelength in colour.wavelengths_m]
     whole = doe.transmission[np.array(seen)]

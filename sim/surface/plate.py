@@ -17,7 +17,7 @@ from fab.layout.polygons import run_lengths
 from fab.level_map import LevelMap
 from fab.levels import height_of, planes
 from fab.process import MaskDisc, Process, Variation
-from fab.units import require_kind
+from fab.units import distances_from, require_kind
 from sim.aperture import circle_coverage, displaced_cells, open_cells, outline_of
 from sim.camera import Camera, SpectralLine
 from sim.metrics import in_parts, zeroth_order
@@ -166,6 +166,8 @@ def as_fabricated(
         ValueError: a level map of another shape than the grid.
     """
     level_map = level_map.level if isinstance(level_map, LevelMap) else level_map
+    require_kind("level_map", level_map, np.ndarray, "A design has one: design.level_map.")
+    depths_m = distances_from(depths_m, "depths_m") or (np.inf,)
     require_kind("camera", camera, Camera, "A design has one: design.camera.")
     require_kind("process", process, Process, 'For example fab.process_from("contact_aligner", levels).')
     require_kind("variation", variation, Variation, "For example fab.Variation(common_depth_scale=0.02).")

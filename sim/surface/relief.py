@@ -259,5 +259,8 @@ def require_possible(grid: Grid, process: Process, variation: Variation) -> None
         for value in np.ravel(getattr(variation, name)):
             if not np.isfinite(value):
                 raise InputError(f"variation.{name}", "must be finite", value, "Correct it.")
+            if deviation.source == "depth" and value < -1:
+                rule = "no etch is shallower than nothing: must be -1 or more"
+                raise InputError(f"variation.{name}", rule, value, "Give a share, -0.02 for 2 % too shallow.")
             if deviation.one_sided and value < 0:  # it would be taken for 0, or for its opposite
                 raise InputError(f"variation.{name}", "must not be negative", value, "Give 0 or more.")

@@ -137,3 +137,11 @@ def test_messages_name_the_file(tmp_path: Path):
         drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)
     with pytest.raises(InputError, match=r"high\.npy: no height may lie more than half a step above"):
         drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)
+
+
+def test_a_height_map_is_drawn_under_the_name_of_its_file_without_accents(tmp_path: Path):
+    """Letters with accents were left out, and names of two files could become one."""
+    for file, name in (("Müller-étalon 2.npy", "Muller_etalon_2"), ("плата.npy", "height")):
+        np.save(tmp_path / file, np.zeros((4, 4)))
+        drawn = drawing_from(tmp_path / file, 16, step_m=STEP_M, pitch_m=1e-6)
+        assert (drawn.level_map.name, drawn.origin["name"]) == (name, file)

@@ -26,6 +26,7 @@ AZIMUTH = np.arctan2(GRID.axis_m("y")[:, None], GRID.axis_m("x"))
 HEIGHT = fab.HeightMap((AZIMUTH / (2 * np.pi) % 1.0) * 4 * STEP_M, GRID, 60e-6)  # a vortex
 PLATE = fab.LevelMap.from_height(HEIGHT, LEVELS, "vortex", wrapped=True)
 DESIGN = dd.Design(PLATE, CAMERA, (), (np.inf,))
+SPOT = dd.Spots(np.array([[0.0, 1e4]]), np.ones(1))
 
 
 @pytest.mark.usefixtures("annotations_unchecked")
@@ -155,6 +156,37 @@ def test_the_run_sheet_of_ones_own_plate_says_what_it_is_made_of_and_what_light_
         (lambda: fab.write_order("order", HEIGHT.height_m), r"level_map: must be a LevelMap, but got a ndarray\."),
         (lambda: fab.write_level_map("map.npz", HEIGHT), "level_map: must be a LevelMap, but got a HeightMap"),
         (lambda: fab.verify(PLATE), "order: must be a folder, or what write_order returned, but got a LevelMap"),
+        (lambda: dd.write_masks(DESIGN, "order", stp_m=3), r"stp_m: must be an argument that there is, .*are step_m, "),
+        (lambda: dd.write_masks(DESIGN, DESIGN), "out: must be the path of a file or a folder, but got a Design"),
+        (lambda: dd.train("x.toml"), r"design: must be a Design, but got a str\. Of a run: dd\.open_design"),
+        (lambda: dd.finetune("model", "pairs"), r"model: must be a Model, but got a str\. .*dd\.Model\.open"),
+        (lambda: dd.predict("x", None, None), r"design: must be a Design, but got a str\. .*dd\.open_design"),
+        (lambda: dd.camera_from_spec({}), r"spec: must be a Spec, but got a dict\. Read it by dd\.load_spec"),
+        (lambda: dd.process_from_spec("stepper"), r"spec: must be a Spec, but got a str\. .*fab\.process_from"),
+        (lambda: dd.order_table(DESIGN, [0, 1]), r"spots: must be a Spots, but got a list\. For example dd\.Spots"),
+        (lambda: dd.order_table("x", SPOT), "optic: must be a DOE of cells, but got a str"),
+        (
+            lambda: dd.order_table(DESIGN, SPOT, colour=1),
+            r"colour: must be the number of a colour, 0 to 0, but got 1\.",
+        ),
+        (lambda: dd.area_table(DESIGN, "square"), "target: must be an AreaTarget, but got a str"),
+        (lambda: dd.focus_table(DESIGN, 5e-3), "foci: must be a Foci, but got a float"),
+        (lambda: dd.simulate_files(DESIGN, "out"), r"design: must have a spec, .* but got none\. Of one picture: dd"),
+        (
+            lambda: dd.simulate(np.ones((16, 16)), DESIGN, obstruction=3, occlusion="paper"),
+            "obstruction: must be a kind of .* but got 3",
+        ),
+        (lambda: dd.write_report(3), "run: must be a design, a run or its folder, but got a int"),
+        (
+            lambda: dd.explain_ratio(DESIGN, dd.Targets("550 nm", 0.01, 1.0), process="stepper"),
+            "probe: must be positive, but got '550 nm'",
+        ),
+        (lambda: dd.simulate_files("run", "out"), "design: must be a Design, but got a str"),
+        (lambda: dd.reconstruct_files("model", [], "out"), "model: must be a Model, but got a str"),
+        (lambda: dd.import_objectives("x.toml"), r"spec: must be a Spec, but got a str\. Read it"),
+        (lambda: dd.tolerance(DESIGN, process="stepper", limits=3), r"limits: must be .*, as text, but got \[3\]"),
+        (lambda: dd.tolerance(DESIGN, process="stepper", limits=[3]), r"limits: must be .* but got \[3\]"),
+        (lambda: dd.tolerance(DESIGN, process="stepper", seed="0"), "seed: must not be negative, a whole .*'0'"),
     ],
 )
 def test_other_slips_of_a_notebook_are_told(call, told, tmp_path, monkeypatch):
@@ -221,3 +253,29 @@ def test_what_a_design_aims_at_is_shown_by_a_notebook(name, changes, words, tmp_
     for text in shown:
         assert words in text
         assert "data:image/png" in text
+
+
+def test_tables_of_spots_and_foci_look_at_a_design():
+    optic = DESIGN.as_optic()
+    assert dd.order_table(DESIGN, SPOT).efficiency == dd.order_table(optic, SPOT).efficiency
+    bare = replace(CAMERA, focal_length_m=np.inf, distance_m=5e-3)
+    foci = dd.Foci(np.array([5e-3]), np.array([5e-5]), np.ones(1), np.zeros(1, int))
+    assert (
+        dd.focus_table(dd.Design(PLATE, bare), foci).strength == dd.focus_table(optic.with_camera(bare), foci).strength
+    )
+
+
+def test_a_repair_of_ones_own_plate_knows_which_levels_are_near_each_other(monkeypatch):
+    """Levels of a relief that is not one wave high were taken for those of one that is."""
+
+    class Planned(Exception):
+        pass
+
+    def plan(*given: Any, **asked: Any):
+        raise Planned(asked["waves_per_metre"])
+
+    monkeypatch.setattr("doedesign.lab.order.plan_order", plan)
+    lower = fab.LevelMap(PLATE.level, fab.Levels(4, STEP_M / 2), GRID, 60e-6)
+    with pytest.raises(Planned) as planned:
+        dd.write_masks(dd.Design(lower, CAMERA), "order", on_violation="fix")
+    assert planned.value.args == pytest.approx([1 / (4 * STEP_M)], rel=1e-6)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -180,6 +181,13 @@ def test_specs_are_frozen():
 
 
 # --- overrides --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("annotations_unchecked")
+@pytest.mark.parametrize("changes", [None, 8, [8], {"process.levels": 8}])
+def test_overrides_that_are_no_texts_are_told(changes: Any):
+    with pytest.raises(InputError, match=r"overrides: must be several changes, as text, .*\[\"process\.levels=8\"\]"):
+        load_spec(AUTOMOTIVE, changes)
 
 
 def test_overrides_change_single_values():

@@ -275,6 +275,22 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, read):
         read(tmp_path)
 
 
+def test_no_pipe_or_device_is_replaced_by_a_file(tmp_path):
+    """Whoever may do so replaced /dev/null, for every program of the machine, by a report."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "null").symlink_to("/dev/null")
+    (tmp_path / "stdout").symlink_to("/proc/self/fd/1")
+    before = {path.name: os.lstat(path).st_ino for path in tmp_path.iterdir()}
+    for name in before:
+        with pytest.raises(InputError, match=f"{name}: must be a file, or nothing yet, but got a pipe, socket or dev"):
+            write_atomic(tmp_path / name, b"report")
+    assert {path.name: os.lstat(path).st_ino for path in tmp_path.iterdir()} == before
+    (tmp_path / "elsewhere").write_bytes(b"kept")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    write_atomic(tmp_path / "link", b"report")  # a link that somebody planted leads nowhere else
+    assert (tmp_path / "elsewhere").read_bytes() == b"kept"
+
+
 def test_a_file_beyond_the_limit_is_refused(tmp_path):
     (tmp_path / "large").write_bytes(b"12345")
     assert read_bytes(tmp_path / "large", 5) == b"12345"

@@ -268,6 +268,15 @@ def test_a_name_of_which_nothing_is_left_is_refused():
         plain_name("***")
 
 
+@pytest.mark.parametrize(("name", "lost"), [("größe", ["größe leave out öß and begin with GR_SSE"]), ("plate", [])])
+def test_letters_that_mask_shops_do_not_take_are_said_to_be_left_out(name, lost, caplog):
+    """They were left out without a word."""
+    job(name=name)
+    assert [
+        line.split(": of ")[1].replace("the names of files and cells ", "") for line in caplog.messages if "A-Z" in line
+    ] == lost
+
+
 def test_whole_numbers_stand_for_lengths_and_shares_too(tmp_path, levels):
     level_map = wide_map(np.indices((40, 40)).sum(axis=0) % 16, levels, Grid((40, 40), 4e-6))
     asked = {

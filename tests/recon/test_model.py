@@ -124,7 +124,12 @@ def test_other_psfs_are_taken_at_the_distance_that_the_network_was_trained_for(m
     trained = replace(model, far_m=6.0)
     other = bank(seed=1)
     write_bank(tmp_path / "made.exr", other)
-    found = trained.psfs([tmp_path / "made.exr"])
+    found = trained.psfs(str(tmp_path / "made.exr"), near_m="5 cm")
+    np.testing.assert_array_equal(found.near, other.at(0.05))
+    with pytest.raises(InputError, match=r"near_m: must be a positive distance, but got -50 mm\."):
+        trained.psfs(near_m=-0.05)
+    with pytest.raises(InputError, match="far_m: must be metres or text with a unit"):
+        trained.psfs(far_m="far")
     assert (found.far_m, trained.psfs().far_m) == (6.0, 6.0)
     np.testing.assert_array_equal(found.far, other.at(6.0))
     assert model.psfs([tmp_path / "made.exr"]).far_m == np.inf  # it says none

@@ -89,6 +89,28 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
         np.testing.assert_allclose(srgb_from_linear(other.light), srgb_from_linear(one.light), atol=SIXTEEN)
 
 
+def test_a_capture_that_is_none_is_told_before_the_first_is_reconstructed(tmp_path: Path, run: Path, capture: Path):
+    """It left a folder of no results, or was told after those before it."""
+    (tmp_path / "notes.md").write_text("no picture")
+    for wrong in ("notes.md", "missing.png"):
+        with pytest.raises(InputError, match=wrong):
+            reconstruct(run, [capture, tmp_path / wrong], tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("annotations_unchecked")
+def test_paths_may_be_text(tmp_path: Path, run: Path, capture: Path):
+    """A folder that was text ended in an AttributeError, and one capture was taken for its letters."""
+    model = Model.open(run)
+    assert reconstruct_files(model, str(capture), str(tmp_path / "out")) == [tmp_path / "out" / "capture.exr"]
+    given: Any = [3]
+    with pytest.raises(InputError, match="captures: must be the path of a file or a folder, but got an int"):
+        reconstruct_files(model, given, tmp_path / "out")
+    asked: Any = {"tile": "32"}
+    with pytest.raises(InputError, match=r"tile, overlap: tile must be a multiple of \d+, but got 32"):
+        reconstruct_files(model, capture, tmp_path / "out", **asked)
+
+
 def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Path):
     out = tmp_path / "out"
     reconstruct(run, [capture], out, near_m=0.07, kind=".png", beside=True)
@@ -255,7 +277,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
             {"near_m": -0.1},
         ),
         "nan depth": (
-            "far_m: must be a positive distance",
+            "far_m: must be metres or text with a unit",
             {"far_m": np.nan},
         ),
         "order": (

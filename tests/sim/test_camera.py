@@ -109,7 +109,7 @@ def test_a_camera_can_be_a_static_argument():
         ({"focal_length_m": np.inf, "distance_m": -0.1}, "distance_m: must be metres"),
         ({"material": "glass"}, "material: must be one of"),
         ({"aperture": 0.0}, "aperture: must be at least a cell wide"),
-        ({"aperture": np.nan}, "aperture: must be at least a cell wide"),
+        ({"aperture": np.nan}, "aperture: must be a diameter or [width, height], but got nan"),
         ({"aperture": 1e-9}, "aperture: must be at least a cell wide"),  # sampled for hours
         ({"aperture": np.inf}, "aperture: must be at least a cell wide"),
         ({"aperture": RectangularAperture((1e-3, -1e-3))}, "aperture: must be at least a cell wide"),

@@ -11,16 +11,33 @@ import pytest
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.levels import Levels
+from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.illumination import EvenBeam, GaussianBeam, MeasuredBeam
-from sim.material import full_wave_height_m, refractive_index
-from sim.metrics import encircled_energy
+from sim.imaging.formation import Optics, capture
+from sim.imaging.glare import Glare
+from sim.imaging.scene import Scene
+from sim.material import fresnel_transmission, full_wave_height_m, refractive_index
+from sim.metrics import encircled_energy, energy_budget, ring_to_disc
+from sim.optic import HeightOptic
 from sim.psf_bank import PsfBank
+from sim.rigorous.edge_optic import with_edges
+from sim.store import read_bank, write_bank, write_height
+from sim.surface import as_fabricated
+from sim.surface.leakage import split_psf
+from sim.transfer import mtf
 from tests.pictures import require_place_of_axes, require_whole
 
 COLOURS = (Colour("green", (550e-9,), (1.0,)),)
 CAMERA = Camera(Grid((32, 32), 2e-6), 60e-6, "fused_silica", COLOURS, 1e-3, 2e-6, 32)
 EVEN = np.ones((8, 8))
+BANK = PsfBank(np.ones((1, 2, 8, 8)), ("green",), (0.05, np.inf), 2e-6)
+BARE = HeightOptic.of(CAMERA)
+SCENE = Scene(np.ones((1, 8, 8), np.float32), 5.0)
+OPTICS = Optics(np.ones((1, 1, 3, 3), np.float32), 60e-6, 1e-3, 2e-6)
+FLAT = np.zeros((32, 32), np.uint8)
+IDEAL = Process(Levels(4, 300e-9))
 
 
 @pytest.mark.usefixtures("annotations_unchecked")
@@ -61,6 +78,49 @@ EVEN = np.ones((8, 8))
         (lambda: PsfBank(EVEN[None, None], ("g",), np.inf, 2e-6), "depths_m: must be one for each PSF, but got inf"),
         (lambda: PsfBank(EVEN[None, None], ("g",), (np.inf,), 0), "pixel_m: must be a positive number of metres"),
         (lambda: PsfBank(EVEN[None, None], ("g",), (np.inf,), "2 um"), "pixel_m: must be a positive number .*'2 um'"),
+        (lambda: replace(CAMERA, colours=()), r"colours: must be colour channels, but got \(\)"),
+        (lambda: encircled_energy([1.0], 2e-6, [1e-6]), r"psfs: must be energies \[\.\.\., y, x\], but got list of"),
+        (lambda: encircled_energy(EVEN, "2 um", [1e-6]), "pixel_m: must be a positive number .*'2 um'"),
+        (lambda: BANK.at("2 cm"), "depth: must lie within the depths of the PSF bank, 0.05 to inf m, but got 0.02 m"),
+        (lambda: BANK.at(None), "depth: must be metres or text"),
+        (lambda: BANK.plot("x.png"), "ax: must be an Axes, but got a str"),
+        (lambda: BANK.with_camera("lens"), r"camera: must be a Camera, but got a str\. A design has one"),
+        (lambda: ring_to_disc(EVEN, None, 0.05), "camera: must be a Camera, but got a NoneType"),
+        (lambda: ring_to_disc(EVEN, CAMERA, -0.05), r"depth_m: must be a positive distance, but got -50 mm\."),
+        (lambda: energy_budget(EVEN, EVEN, 0.05, COLOURS[0]), "optic: must be a DOE of cells, but got a ndarray"),
+        (lambda: energy_budget(BARE, EVEN, np.nan, COLOURS[0]), "depth_m: must be metres"),
+        (lambda: energy_budget(BARE, EVEN, 0.05, "green"), "colour: must be a Colour, but got a str"),
+        (lambda: split_psf(BARE, np.inf, COLOURS[0]), "doe: must be a FabricatedDoe, but got a HeightOptic"),
+        (lambda: HeightOptic.of(None), "camera: must be a Camera"),
+        (lambda: with_edges(np.zeros((32, 32)), "lens"), "camera: must be a Camera"),
+        (lambda: with_edges(np.zeros((32, 32)), CAMERA, depths_m=0.05), "depths_m: must be several distances"),
+        (
+            lambda: as_fabricated(None, CAMERA, IDEAL, Variation()),
+            "level_map: must be a ndarray, but got a NoneType",
+        ),
+        (lambda: as_fabricated(FLAT, CAMERA, IDEAL, Variation(), depths_m=(np.nan,)), "depths_m: must be several"),
+        (
+            lambda: as_fabricated(FLAT, CAMERA, IDEAL, Variation(common_depth_scale=-2.0)),
+            r"variation\.common_depth_scale: no etch is shallower than nothing: .* but got -2\.0",
+        ),
+        (lambda: as_fabricated(FLAT, CAMERA, IDEAL, Variation(depth_scale=(0.0, -1.1))), r"variation\.depth_scale: no"),
+        (lambda: fresnel_transmission("1.5"), "index: must be a number of 1 or more, but got '1.5'"),
+        (lambda: fresnel_transmission(-1), "index: must be a number of 1 or more"),
+        (lambda: Glare("2 %"), r"glare\.share: must lie from 0 to below 1, but got '2 %'"),
+        (lambda: Glare(window=2.5), r"glare\.window: must be a whole, odd number"),
+        (lambda: Glare(core_px=None), r"glare\.core_px: must be a positive number"),
+        (lambda: capture(EVEN, OPTICS, "paper"), r"scene: must be a Scene, but got a ndarray\. For example sim\.Scene"),
+        (lambda: capture(SCENE, BANK, "paper"), "optics: must be an Optics, but got a PsfBank"),
+        (lambda: capture(SCENE, replace(OPTICS, aperture_m=-1e-3), "paper"), "optics: aperture_m: must be a positive"),
+        (lambda: capture(SCENE, replace(OPTICS, pixel_m="2 um"), "paper"), "optics: pixel_m: .* but got '2 um'"),
+        (lambda: mtf(BARE, count=0), "count: must be a whole number of frequencies, 2 or more, but got 0"),
+        (lambda: write_bank(BANK, "b.exr"), "bank: must be a PsfBank, but got a str"),
+        (lambda: write_bank(3, BANK), "path: must be the path of a file or a folder, but got an int"),
+        (lambda: read_bank("b.exr", 2e-6, "5 cm"), "depth_m: must be a positive number of metres, but got '5 cm'"),
+        (lambda: read_bank("b.exr", 2e-6, np.nan), "depth_m: must be a positive number"),
+        (lambda: write_height("h.exr", EVEN, 0, 8e-6), "pitch_m: must be a positive number of metres, but got 0"),
+        (lambda: write_height("h.exr", EVEN, 1e-6, -8e-6), "aperture: must be positive, but got -8 um"),
+        (lambda: write_height("h.exr", EVEN[0], 1e-6, 8e-6), r"height_m: must be a map \[y, x\], but got the shape"),
     ],
 )
 def test_slips_are_told_in_words(call, told):
@@ -91,3 +151,8 @@ def test_psfs_without_a_camera_are_drawn_and_summed(sines, rng):
     assert panes[0].get_ylabel().startswith("red\ny (°" if sines else "red\ny (µm)")
     with pytest.raises(InputError, match=r"must be known for metrics, but got None\. Give it by bank\.with_camera"):
         bank.ring_to_disc()
+
+
+def test_a_bank_is_asked_for_depths_with_a_unit():
+    np.testing.assert_array_equal(BANK.at("5 cm"), BANK.at(0.05))
+    np.testing.assert_array_equal(BANK.at("inf"), BANK.energy[:, 1])

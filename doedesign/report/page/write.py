@@ -10,7 +10,7 @@ from doedesign.report.page.files import work_state
 from doedesign.report.page.gather import gather
 from doedesign.report.page.render import render
 from fab.errors import InputError
-from fab.files import os_errors_explained, write_atomic
+from fab.files import os_errors_explained, path_of, write_atomic
 
 if TYPE_CHECKING:
     from doedesign.design.design import Design
@@ -48,7 +48,7 @@ def write_report(
         cure = "Leave it out: a comparison shows no order."
         raise InputError("order", "does not go with other runs to compare with", str(order), cure)
     folder, others = _folder_of(run), [_folder_of(one) for one in compare]
-    path = Path(out) if out is not None else folder / ("comparison.html" if others else "report.html")
+    path = path_of(out, "out") if out is not None else folder / ("comparison.html" if others else "report.html")
     if path.is_file() and not _is_page(path):
         raise InputError(str(path), "a report must not replace another file", "no report", "Choose another place.")
     given = None if order is None else Path(order)
@@ -58,6 +58,9 @@ def write_report(
 
 
 def _folder_of(run: "Design | Run | str | Path") -> Path:
+    if not isinstance(run, str | Path) and not hasattr(run, "folder"):
+        rule, cure = "must be a design, a run or its folder", 'For example "runs/NAME".'
+        raise InputError("run", rule, f"a {type(run).__name__}", cure)
     folder = run if isinstance(run, str | Path) else run.folder
     if folder is None:
         cure = "Optimise it into a folder, or give that of its run."

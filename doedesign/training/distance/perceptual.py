@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from doedesign.training.distance.backbones import LEAST_PX, Backbone, backbone_of, convolutions, taps_of, weight_shapes
 from doedesign.training.distance.similarity import Images, MsSsim
 from fab.errors import InputError
-from fab.files import opened, sha256_file
+from fab.files import opened, paths_of, sha256_file
 from fab.pictures import decoding
 
 # Mean and spread of each colour that the backbones were trained with, for values from -1 to 1.
@@ -132,7 +132,7 @@ def weights_of(backbone_state: Mapping[str, ArrayLike], head_state: Mapping[str,
     return _checked(found, "the state dicts")[1]
 
 
-def read_lpips(paths: Sequence[Path]) -> Lpips:
+def read_lpips(paths: str | Path | Sequence[str | Path]) -> Lpips:
     """Read LPIPS from `.npz` files that together hold a backbone (torchvision's names) and its heads (lin0, lin1, ...).
 
     Other arrays in them are left alone. Half precision is widened.
@@ -141,6 +141,7 @@ def read_lpips(paths: Sequence[Path]) -> Lpips:
         InputError: a file cannot be read, or a weight is missing, there twice, of another shape, or not finite.
     """
     weights: dict[str, np.ndarray] = {}
+    paths = paths_of(paths, "lpips_weights")
     for path in paths:
         more = _read_npz(path)
         if twice := sorted(weights.keys() & more.keys()):
