@@ -355,8 +355,6 @@ def psf(
     """
     depths_m, field_rad = depths_from(depths), field_from(field_rad)
     chosen = optic_of(optic, camera, depths_m)
-    if not chosen.colours:
-        raise InputError("colours", "a camera must have one for each PSF", "none", "Give its colour channels.")
     traced = is_traced(chosen) or in_jit()
 
     def light(asked: tuple[float, SpectralLine]) -> Any:

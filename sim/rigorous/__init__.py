@@ -2,7 +2,8 @@
 
 rows             coupled waves of a row that repeats
 crossed          Fourier modes of a square that repeats along both axes (fmmax)
-mirrored         relief with mirrors: one layer with the gradient of its orders, and squares of cells of many heights
+mirrored         one layer with a mirror, and the gradient of its orders
+mirrored_squares squares of cells with two mirrors
 edge_widths      what the wall between two heights adds to a thin element: a line of light and a dipole
 width_tables     the same by height, shipped or computed once
 corner_light     what a corner adds where walls of both axes meet
@@ -27,7 +28,8 @@ from sim.rigorous.certificate import (
 from sim.rigorous.comparison import RowComparison, compare_row, thin_amplitudes
 from sim.rigorous.crossed import CrossedOrders, crossed_orders
 from sim.rigorous.edge_widths import edge_dipoles, edge_widths
-from sim.rigorous.mirrored import MirroredLayer, mirrored_orders, with_mirrors
+from sim.rigorous.mirrored import MirroredLayer
+from sim.rigorous.mirrored_squares import mirrored_orders, with_mirrors
 from sim.rigorous.pieces import PieceComparison, compare_piece, thin_piece_amplitudes
 from sim.rigorous.rows import Orders, Slab, orders_of, row_slabs
 from sim.rigorous.slab_cell import SlabCell

@@ -15,7 +15,7 @@ from sim.camera import Camera
 from sim.material import refractive_index
 from sim.rigorous.comparison import RowComparison, compare_row
 from sim.rigorous.crossed import travelling_terms
-from sim.rigorous.mirrored.relief import with_mirrors
+from sim.rigorous.mirrored_squares import with_mirrors
 from sim.rigorous.pieces import PieceComparison, compare_piece
 from sim.threads import cores
 

@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float, Shaped
 from sim.rigorous.corner_light import CornerCell, corner_light, corner_unit
 from sim.rigorous.crossed import CROSSED_POLARISATIONS, crossed_orders
 from sim.rigorous.edge_widths import light_of_walls
-from sim.rigorous.mirrored.relief import is_mirrored, mirrored_orders
+from sim.rigorous.mirrored_squares import is_mirrored, mirrored_orders
 from sim.rigorous.rows import Polarisation
 
 

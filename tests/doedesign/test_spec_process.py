@@ -119,7 +119,7 @@ def test_reticles_of_a_stepper_stay_larger():
     assert process_from_spec(load_spec(AUTOMOTIVE, ['process.stock="stepper"']).process).reduction == 5
     assert process_from_spec(load_spec(AUTOMOTIVE, ["process.reduction=4"]).process).reduction == 4
     assert "process.reduction" in refusal(load_spec, AUTOMOTIVE, ["process.reduction=0"])
-    with pytest.raises(InputError, match="process: reduction: must be 1 or more"):
+    with pytest.raises(InputError, match="process: reduction: must be a whole number, 1 or more"):
         replace(stepper, reduction=0)
 
 

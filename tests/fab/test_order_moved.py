@@ -102,7 +102,7 @@ def test_edges_may_be_given_by_mask_whatever_the_process_is_known_for():
     [
         ({"edge_moves_m": (1e-7,) * 4, "compensate": True}, "or against the bias, but got both"),
         ({"edge_moves_m": (2e-4,)}, "must be at most 100 um"),
-        ({"edge_moves_m": (float("nan"),)}, "must be at most 100 um"),
+        ({"edge_moves_m": (float("nan"),)}, "must be several numbers of metres"),
     ],
 )
 def test_moves_that_cannot_be_are_refused(wafer, words):

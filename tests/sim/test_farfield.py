@@ -8,7 +8,7 @@ import pytest
 from bench.reference import YELLOW_M, make_camera, relative_error, wrapped_map
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera
+from sim.camera import Camera, Colour
 from sim.propagation.farfield import TOLERANCE, FarField, displaced, plan_far_field
 from sim.propagation.pixel import Banded
 from sim.propagation.pupil import DoeRows, doe_field
@@ -156,6 +156,7 @@ def test_the_default_sampling_predicts_its_tolerance():
 
 
 def test_impossible_plans_are_refused():
-    camera = Camera(Grid((8, 8), 1e-6), 8e-6, "fused_silica", (), 1e-3, 2e-6, 8)
+    yellow = Colour("yellow", (YELLOW_M,), (1.0,))
+    camera = Camera(Grid((8, 8), 1e-6), 8e-6, "fused_silica", (yellow,), 1e-3, 2e-6, 8)
     with pytest.raises(ValueError, match="must be at least 1"):
         plan_far_field(camera, YELLOW_M, sampling=0.5)

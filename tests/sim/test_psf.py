@@ -166,8 +166,3 @@ def test_a_bank_has_one_entry_for_each_colour_and_depth():
     with pytest.raises(InputError, match="depth: must lie within the depths of the PSF bank"):
         bank.at(0.0)
     assert jax.tree.map(np.sum, bank).energy == 150  # what jax makes of one is not looked at
-
-
-def test_a_camera_without_colours_has_no_psfs():
-    with pytest.raises(InputError, match="colours: a camera must have one for each PSF, but got none"):
-        psf(HEIGHT, dataclasses.replace(ONE, colours=()))

@@ -1,4 +1,4 @@
-"""Light of relief that repeats and has a mirror: one layer with the gradient of its orders, or cells of many heights.
+"""Light of relief that repeats and has mirrors, in cosines and sines: one layer, and what squares of cells need.
 
 At normal incidence through a layer without loss that is its own mirror image along x, the field divides into two parts
 that do not know of each other, and light along x or y excites one. In cosines and sines instead of exponentials its
@@ -9,7 +9,6 @@ are found by doubling, in products of matrices. The gradient is that of the adjo
 system, and an integral over the depth.
 
     layer       one layer between two half-spaces, its orders, and their gradient: for refinement
-    relief      square cells of many heights with two mirrors, and their orders: for certificates
     basis       cosines and sines of a symmetry, half-spaces, and the equations of a layer
     sectors     the functions, and matrices of multiplication between them
     directions  directions along walls
@@ -17,6 +16,5 @@ system, and an integral over the depth.
 """
 
 from sim.rigorous.mirrored.layer import MirroredLayer
-from sim.rigorous.mirrored.relief import mirrored_orders, with_mirrors
 
-__all__ = ["MirroredLayer", "mirrored_orders", "with_mirrors"]
+__all__ = ["MirroredLayer"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import sim.rigorous.mirrored.relief as relief
+import sim.rigorous.mirrored_squares as relief
 from fab.errors import InputError
 from sim.material import refractive_index
 from sim.rigorous import compare_piece, crossed_orders, mirrored_orders, orders_of, row_slabs, with_mirrors
