@@ -22,7 +22,6 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +39,7 @@ from fab.process import (
     short_name,
     variation_of,
 )
+from fab.units import is_whole
 
 _ALL_CORNERS = 6  # errors up to which every combination of signs is tried
 NOMINAL, EXPECTED = "nominal", "expected"
@@ -226,7 +226,7 @@ def variation_at(process: Process, seed: int, plate_m: float, key: str) -> Varia
     Raises:
         InputError: no such key in a study of this process.
     """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+    if not is_whole(seed, 0):
         raise InputError("seed", "must be a whole number of 0 or more", seed, "Change it.")
     seed, cause = int(seed), None
     try:

@@ -7,7 +7,6 @@ A `Process` is the recipe: which etches, in which order and how deep, and how la
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from numbers import Integral
 from typing import Literal, NamedTuple
 
 from fab.deviations import (
@@ -24,7 +23,7 @@ from fab.deviations import (
 from fab.errors import InputError
 from fab.files import IF_ANY
 from fab.levels import Levels
-from fab.units import MM, UM, number_of, numbers_of, require_kind
+from fab.units import MM, UM, is_whole, number_of, numbers_of, require_kind
 
 __all__ = [
     "DEVIATIONS",
@@ -139,7 +138,7 @@ class Process:
                 rule, cure = "must be finite and not negative, in metres", "Give 0 or more, such as 1e-6."
                 raise InputError(f"process: {name}", rule, repr(getattr(self, name)), cure)
             object.__setattr__(self, name, float(getattr(self, name)))  # rules of an order are told as they are kept
-        if not isinstance(self.reduction, Integral) or isinstance(self.reduction, bool) or self.reduction < 1:
+        if not is_whole(self.reduction, 1):
             rule = "must be a whole number, 1 or more"
             raise InputError("process: reduction", rule, repr(self.reduction), "For example 5.")
         self._check_die()

@@ -8,7 +8,7 @@ therefore loaded on the first use.
 import math
 import re
 from functools import cache
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -98,6 +98,11 @@ def number_of(value: object) -> float:
         return float(value)
     except OverflowError:  # an integer beyond all floats
         return math.inf
+
+
+def is_whole(value: object, least: int, most: float = math.inf) -> bool:
+    """Whether a value is a whole number, perhaps of numpy, from `least` to `most`; True and False are none."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) <= most
 
 
 def numbers_of(value: object) -> tuple[float, ...]:

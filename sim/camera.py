@@ -7,7 +7,6 @@ out of focus, or one without a lens, leaves a quadratic remainder (`Camera.curva
 
 import math
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -16,7 +15,7 @@ from jaxtyping import Complex, Float
 from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.units import DEGREES, PlaceUnit, format_length, number_of
+from fab.units import DEGREES, PlaceUnit, format_length, is_whole, number_of
 from sim.illumination import Beam, EvenBeam, GaussianBeam, MeasuredBeam, beam_amplitude, beam_irradiance
 from sim.lens import IDEAL, Distortion, Mapping, check_lens, direction_sines, distorted_place, image_place, sines_at
 from sim.material import fresnel_transmission, material, refractive_index, waves_per_metre
@@ -83,7 +82,7 @@ def _require_length(name: str, value: Any, *, signed: bool = False, infinite: bo
 
 def require_colour(camera: "Camera", colour: int) -> None:
     """Raise an `InputError` for what is no number of one of a camera's colours."""
-    if not isinstance(colour, Integral) or isinstance(colour, bool) or not 0 <= colour < len(camera.colours):
+    if not is_whole(colour, 0, len(camera.colours) - 1):
         rule = f"must be the number of a colour, 0 to {len(camera.colours) - 1}"
         raise InputError("colour", rule, repr(colour), f"They are {', '.join(one.name for one in camera.colours)}.")
 
@@ -213,7 +212,7 @@ class Camera:
         if not isinstance(self.beam, GaussianBeam | MeasuredBeam | EvenBeam | None):
             cure = "For example sim.GaussianBeam((1e-3, 1e-3)), or None for plane light."
             raise InputError("beam", "must be a beam of sim", repr(self.beam), cure)
-        if not isinstance(self.window, Integral) or isinstance(self.window, bool) or self.window < 1:
+        if not is_whole(self.window, 1):
             rule = "must be a whole number of pixels, at least 1, for both axes"
             raise InputError("window", rule, repr(self.window), "For example 128.")
 

@@ -11,7 +11,6 @@ seem to resolve nothing at the sensor's own limit.
 import math
 from dataclasses import dataclass
 from itertools import product
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -20,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fab.errors import InputError
+from fab.units import is_whole
 from sim.camera import Camera, SpectralLine
 from sim.metrics import near_and_far
 from sim.optic import ON_AXIS, CellOptic
@@ -99,7 +99,7 @@ def mtf(
         InputError: a count of frequencies below 2.
         TypeError: an optic that is not made of cells.
     """
-    if not isinstance(count, Integral) or isinstance(count, bool) or count < 2:
+    if not is_whole(count, 2):
         raise InputError("count", "must be a whole number of frequencies, 2 or more", repr(count), "For example 160.")
     depths_m = depths_from(depths)
     doe = optic_of(optic, camera, depths_m)

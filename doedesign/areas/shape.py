@@ -17,8 +17,8 @@ from doedesign.design.given_wave import WaveShare
 from doedesign.spec import input_files
 from doedesign.spec.targets.areas import WITHIN_THE_AREA
 from fab.units import MICROMETRES, MILLIMETRES, PlaceUnit, format_length, require_kind
-from sim.camera import Camera, require_colour
-from sim.metrics import cells_of, zeroth_order
+from sim.camera import Camera
+from sim.metrics import cell_optic_of, zeroth_order
 from sim.optic import CellOptic
 
 if TYPE_CHECKING:
@@ -331,10 +331,9 @@ def area_table(doe: Any, target: AreaTarget, colour: int = 0) -> AreaTable:
     Raises:
         InputError: an argument of another kind, or a colour that the camera does not have.
     """
-    doe = cells_of("doe", doe)
+    doe = cell_optic_of("doe", doe, colour)
     cure = "For example dd.AreaTarget.of(area, camera); areas of a spec are in dd.fabricated(design, seed=0).aimed."
     require_kind("target", target, AreaTarget, cure)
-    require_colour(doe.camera, colour)
     camera = replace(doe.camera, colours=(doe.camera.colours[colour],))
     fields, score = _fields_on(doe, target, colour), AreaScore.of(target)
     light, wave = _light_of(fields), target.wave

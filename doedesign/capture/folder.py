@@ -22,7 +22,6 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
-from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,7 +53,7 @@ from fab.files import (
     write_atomic,
 )
 from fab.process import Process, Variation
-from fab.units import require_kind
+from fab.units import is_whole, require_kind
 from sim.imaging.occlusion import follows_light
 from sim.rigorous.edge_optic import optic_as_drawn
 from sim.surface import as_fabricated
@@ -115,20 +114,16 @@ def simulate_files(
     """
     require_kind("design", design, Design, "Of a run: dd.open_design(folder).")
     if design.spec is None:
-        rule, cure = (
-            "must have a spec, which says what is photographed",
-            "Of one picture: dd.simulate(picture, design).",
-        )
-        raise InputError("design", rule, "none", cure)
+        rule = "must have a spec, which says what is photographed"
+        raise InputError("design", rule, "none", "Of one picture: dd.simulate(picture, design).")
     folder, images = path_of(folder, "folder"), None if images is None else path_of(images, "images")
     kind, model, view, far_m = Stage.of(design, obstruction, occlusion, size)
     pictures = Pictures(picture_files(images), most_px=2 * max(view.shape))
     count = min(_USUAL_COUNT, len(pictures)) if count is None else count
     require_seed(seed)
-    if not isinstance(count, Integral) or isinstance(count, bool) or count < 1:
-        raise InputError(
-            "count", "must be at least 1", repr(count), "Leave it out for one item per picture, at most six."
-        )
+    if not is_whole(count, 1):
+        cure = "Leave it out for one item per picture, at most six."
+        raise InputError("count", "must be at least 1", repr(count), cure)
     data = SceneData(pictures, kind, view, far_m, seed, mirrored=False)
     words = "plate as drawn" if plate is None else f"plate with {plate.words}"
     settings = {

@@ -20,13 +20,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from doedesign.capture.images import Picture, Pictures, crop, linear_light, zoomed
 from fab.errors import InputError
+from fab.units import is_whole
 from sim.imaging.scene import Scene
 from sim.obstruction import CameraView, ObstructionKind
 
@@ -40,7 +40,7 @@ def require_seed(seed: int) -> None:
     Raises:
         InputError: it is no whole number, negative, or beyond 32 bits.
     """
-    if not isinstance(seed, Integral) or not 0 <= seed < 1 << 32:
+    if not is_whole(seed, 0, (1 << 32) - 1):
         raise InputError("seed", "must be from 0 to 4294967295", seed, "For example 0.")
 
 

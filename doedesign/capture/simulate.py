@@ -6,7 +6,6 @@ PSFs are computed at the very depths of the scene; nothing is interpolated betwe
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +29,7 @@ from doedesign.spec import Spec
 from fab.errors import InputError
 from fab.figure import bare, html_of, length_text, panels
 from fab.pictures import read_display
+from fab.units import is_whole
 from sim.camera import Camera
 from sim.imaging.formation import lost_share
 from sim.imaging.occlusion import Model
@@ -198,7 +198,7 @@ class Stage(NamedTuple):
 def _side(spec: Spec | None, size: int | None) -> int:
     most = _MOST_SIDE if spec is None else sensor_side(spec)
     side = min(_USUAL_SIDE, most) if size is None else size
-    if not isinstance(side, Integral) or not 16 <= side <= most:
+    if not is_whole(side, 16, most):
         rule = f"must lie from 16 to the {most} binned pixels of the sensor's shorter side"
         raise InputError("size", rule, side, "Choose another size.")
     return side

@@ -134,7 +134,8 @@ def evaluate(
         design = open_design(run, False, overrides=overrides, free=TRAINING_TABLES)
         assert design.spec is not None  # every run has one
         if robust is not None:  # said before hours of training
-            _require_same_camera(design, open_design(robust, False), path_of(robust, "robust"))
+            robust = path_of(robust, "robust")
+            _require_same_camera(design, open_design(robust, False), robust)
         given = _sources(folder, images, test, licence)
         if train:  # said before hours of it
             _require_apart(given.images, given.test)
@@ -158,7 +159,7 @@ def evaluate(
             images=given.images,
             validation=given.test,
             licence=given.licence,
-            robust=None if robust is None else path_of(robust, "robust"),
+            robust=robust if robust is None else Path(robust),
             lpips_weights=tuple(lpips_weights),
         )
         looked_at = (*chosen, *_looked_through(programs))
@@ -234,8 +235,9 @@ def _sources(folder: Path, images: str | Path | None, test: str | Path | None, l
         rule = "pictures to judge by must come from a folder of their own"
         raise InputError("test", rule, "none", "Give a folder of pictures that are not trained on.")
     if images is not None and test is not None:
-        _require_apart(path_of(images, "images"), path_of(test, "test"))
-        return Sources(path_of(images, "images"), path_of(test, "test"), licence)
+        found = Sources(path_of(images, "images"), path_of(test, "test"), licence)
+        _require_apart(found.images, found.test)
+        return found
     homes = folder / "pictures" / "trained_on", folder / "pictures" / "judged_by"
     samples = sample_files()
     for home, files in zip(homes, ([p for k, p in enumerate(samples) if k % 3], samples[::3]), strict=True):

@@ -14,7 +14,7 @@ from doedesign.focus.foci import Foci
 from doedesign.focus.problem import BESIDE, focus_light
 from fab.units import require_kind
 from sim.camera import Camera
-from sim.metrics import cells_of, zeroth_order
+from sim.metrics import cell_optic_of, zeroth_order
 from sim.optic import CellOptic
 from sim.propagation.near_axis import profiles
 
@@ -157,7 +157,7 @@ def focus_table(doe: Any, foci: Foci) -> FocusTable:
     Raises:
         InputError: an argument of another kind.
     """
-    doe = cells_of("doe", doe)
+    doe = cell_optic_of("doe", doe)
     cure = "For example dd.Foci(distance_m, width_m, weight, colour); those of a spec: dd.fabricated(design).aimed."
     require_kind("foci", foci, Foci, cure)
     camera = doe.camera

@@ -16,9 +16,9 @@ from doedesign.spots.superposition import spot_light
 from fab.aperture import MaskAperture, RoundAperture
 from fab.grid import Grid
 from fab.units import MILLIMETRES, PlaceUnit, require_kind
-from sim.camera import Camera, require_colour
+from sim.camera import Camera
 from sim.illumination import Beam, EvenBeam
-from sim.metrics import cells_of, opening
+from sim.metrics import cell_optic_of, opening
 from sim.propagation.directions import DirectionSum, peak_amplitudes
 
 if TYPE_CHECKING:
@@ -286,10 +286,9 @@ def order_table(
     Raises:
         InputError: an argument of another kind, or a colour that the camera does not have.
     """
-    optic = cells_of("optic", optic)
+    optic = cell_optic_of("optic", optic, colour)
     cure = "For example dd.Spots(waves_per_m, shares); those of a spec are in dd.fabricated(design, seed=0).aimed."
     require_kind("spots", spots, Spots, cure)
-    require_colour(optic.camera, colour)
     camera, line = optic.camera, next(one for one in optic.camera.lines if one.colour == colour)
     # Directions are what a lens would show in its focus, whatever the light on the DOE and the way behind it.
     away = camera.distance_m is not None and not camera.in_angles

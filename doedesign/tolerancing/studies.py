@@ -6,7 +6,7 @@ from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
-from numbers import Integral, Real
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,7 @@ from fab.draws import (
 from fab.errors import InputError
 from fab.files import path_of, sha256_bytes
 from fab.process import DEVIATIONS, Process, Variation, error_names
-from fab.units import require_kind
+from fab.units import is_whole, require_kind
 from sim.camera import Camera
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def study(
         rule = "a tolerance study needs errors that vary"
         cure = 'Give a process with errors, such as "contact_aligner".'
         raise InputError("process", rule, "none with a sigma above zero", cure)
-    if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
+    if not is_whole(seed, 0):
         raise InputError("seed", "must not be negative, a whole number", repr(seed), "For example 0.")
     if not hasattr(evaluate, "__qualname__"):  # by which its draws are known
         raise InputError("evaluate", "must be a function", type(evaluate).__name__, "Write one with def.")
@@ -317,7 +317,7 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, in_mem
 
 def at_least_one(name: str, value: int) -> int:
     """Return a whole number of at least 1, the value of `name`; an InputError for anything else."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+    if not is_whole(value, 1):
         raise InputError(name, "must be at least 1, a whole number", repr(value), "For example 2.")
     return value
 

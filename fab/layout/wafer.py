@@ -67,10 +67,8 @@ class Wafer:
         if self.pitch_m is not None and not 0 < number_of(self.pitch_m) < 1:
             rule, got = "must be positive and below 1 m", told_length(self.pitch_m)
             raise InputError("wafer: pitch_m", rule, got, "Check its unit, or leave it out.")
-        if not isinstance(self.chrome, str) or self.chrome not in (
-            "liftoff",
-            "etch",
-        ):  # another word would change the tone of its photomask
+        # Another word would change the tone of its photomask.
+        if not isinstance(self.chrome, str) or self.chrome not in ("liftoff", "etch"):
             raise InputError("wafer: chrome", 'must be "liftoff" or "etch"', repr(self.chrome), "Choose one of them.")
         if self.blank_m < self.diameter_m:
             rule = f"must hold the wafer of {format_length(self.diameter_m)}"

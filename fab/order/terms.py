@@ -2,11 +2,10 @@
 
 import re
 from dataclasses import dataclass, field, fields
-from numbers import Integral
 
 from fab.errors import InputError
 from fab.files import IF_ANY
-from fab.units import number_of, told_length
+from fab.units import is_whole, number_of, told_length
 
 _REVISION = re.compile(r"[A-Z0-9]{1,3}")
 _LONGEST_TEXT = 200
@@ -77,7 +76,7 @@ class OrderTerms:
         if not _REVISION.fullmatch(self.revision):
             rule = "must be one to three capitals A-Z or digits"
             raise InputError("order: revision", rule, repr(self.revision), 'For example "A" or "02".')
-        if self.quantity is not None and not (isinstance(self.quantity, Integral) and self.quantity >= 1):
+        if self.quantity is not None and not is_whole(self.quantity, 1):
             raise InputError(
                 "order: quantity", "must be a whole number, 1 or more", self.quantity, "Leave it out if it is open."
             )

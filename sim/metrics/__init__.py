@@ -25,7 +25,7 @@ from sim.metrics.measures import (
     spot_radius_m,
 )
 from sim.metrics.table import METRICS, Metric, MetricInputs, metric_rows, without_infinities
-from sim.metrics.transmission import cells_of, in_parts, mean_transmission, opening, strehl, zeroth_order
+from sim.metrics.transmission import cell_optic_of, in_parts, mean_transmission, opening, strehl, zeroth_order
 
 __all__ = [
     "METRICS",
@@ -34,7 +34,7 @@ __all__ = [
     "MetricInputs",
     "RingToDisc",
     "airy_radius_m",
-    "cells_of",
+    "cell_optic_of",
     "disc_radius_m",
     "disc_weights",
     "encircled_energy",

@@ -10,7 +10,7 @@ from scipy.fft import fft
 from fab.units import distance_from, require_kind
 from sim.camera import Colour
 from sim.metrics.measures import far_spot
-from sim.metrics.transmission import cells_of, opening
+from sim.metrics.transmission import cell_optic_of, opening
 from sim.source import source_path_m
 from sim.tracing import total
 
@@ -79,7 +79,7 @@ def energy_budget(
     Raises:
         InputError: something other than a DOE or a colour, or a depth that is not positive.
     """
-    optic = cells_of("optic", optic)
+    optic = cell_optic_of("optic", optic)
     require_kind("colour", colour, Colour, "A camera has them: camera.colours[0].")
     depth_m = distance_from(depth_m, "depth_m")
     camera = optic.camera

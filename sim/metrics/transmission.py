@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from fab.errors import InputError
+from sim.camera import require_colour
 from sim.optic import CellOptic
 from sim.tracing import is_traced, stacked, total
 
@@ -17,16 +18,20 @@ def mean_transmission(doe: Any) -> Complex[np.ndarray, " w"] | Complex[Array, " 
 
     `doe` is an optic of cells, or what carries one, such as a design; an InputError for anything else.
     """
-    cells = cells_of("doe", doe)
+    cells = cell_optic_of("doe", doe)
     return _mean_over_aperture(cells, cells.means)
 
 
-def cells_of(name: str, doe: Any) -> CellOptic:
-    """The optic of cells that a `doe` is or carries, the value of `name`; an InputError for anything else."""
+def cell_optic_of(name: str, doe: Any, colour: int = 0) -> CellOptic:
+    """The optic of cells that a `doe` is or carries, the value of `name`, to be looked at in the light of a colour.
+
+    An InputError for anything else, or for a colour that its camera does not have.
+    """
     found = doe.as_optic() if hasattr(doe, "as_optic") else doe
     if not isinstance(found, CellOptic):
         cure = "Give a design, a DOE as fabricated, or sim.HeightOptic.of(camera, height_m)."
         raise InputError(name, "must be a DOE of cells", f"a {type(doe).__name__}", cure)
+    require_colour(found.camera, colour)
     return found
 
 
@@ -68,7 +73,7 @@ def strehl(doe: Any, nominal: Any) -> Float[np.ndarray, " w"] | Float[Array, " w
     Each is an optic of cells, or what carries one, such as a design; an InputError for anything else. The cells of
     `doe` and those of `nominal` may be parts of those that were drawn.
     """
-    doe, nominal = cells_of("doe", doe), cells_of("nominal", nominal)
+    doe, nominal = cell_optic_of("doe", doe), cell_optic_of("nominal", nominal)
     (ny, nx), other = doe.camera.grid.shape, nominal.camera.grid.shape[0]
     xp, common = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np, math.lcm(ny, other)
     meant = in_parts(xp.conj(xp.asarray(nominal.means)), common // other)

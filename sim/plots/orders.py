@@ -35,9 +35,10 @@ def plot_certificate(
     shown = wavelengths if len(wavelengths) <= _SHOWN else [wavelengths[0], wavelengths[-1]]
     title = f"{name}: light at its walls".lstrip(": ")
     note = (
-        "Parts cut out of the design, solved as gratings that repeat by coupled waves. Off: root of the summed squares "
-        "of differences of all orders in the band, over that of the rigorous orders; circles and squares are means of "
-        "both polarisations, bars reach from one to the other."
+        "Parts cut out of the design, solved as gratings that repeat, by Maxwell's equations; squares of more than 2 x "
+        "2 cells are continued by mirrors. Off: root of the summed squares of differences of all orders in the band, "
+        "over that of the rigorous orders; circles and squares are means of both polarisations, bars reach from one to "
+        "the other."
     )
     with panels(ax, (8.6, 2.3 + 2.3 * len(shown)), title, note) as figure:
         ratios = [1.15] + [1.0] * len(shown)

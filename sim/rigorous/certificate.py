@@ -205,7 +205,7 @@ def certify_pieces(
     """Solve squares that are continued by mirrors, lit from the air at normal incidence, at every wavelength.
 
     Args:
-        pieces: of `cut_pieces`, with sides of 2 to 4 cells.
+        pieces: of `cut_pieces`.
         camera: pitch and substrate.
         wavelengths_m: vacuum wavelengths.
         on_piece: called after every one, for progress.
@@ -214,7 +214,7 @@ def certify_pieces(
 
     def solved(wavelength_m: float, piece: Piece) -> CertifiedPiece:
         given = pitch_m, wavelength_m, refractive_index(camera.material, wavelength_m)
-        square, waves = piece.repeated_m, _PIECE_WAVES[len(piece.height_m)]
+        square, waves = piece.repeated_m, _PIECE_WAVES.get(len(piece.height_m), min(_PIECE_WAVES.values()))
         terms = travelling_terms(square.shape, *given, waves)
         coarse, fine = (compare_piece(square, *given, count) for count in (round(_COARSE * terms), terms))
         return CertifiedPiece(piece, wavelength_m, fine, fine.error(coarse.rigorous))
